@@ -120,6 +120,16 @@ def packed_from(clips, *, styles=("calm", "proud"), mirror_styles=()) -> PackedM
     )
 
 
+def walks_of(styles, splits=(0, 0, 1, 2, 2), seconds: float = 4.0) -> PackedMotion:
+    """Packed walks of these styles of the synthetic walker, one of each for each split number."""
+    made = [
+        (synthetic.synthesize(style, seconds, seed), number, split)
+        for number, style in enumerate(styles)
+        for seed, split in enumerate(splits)
+    ]
+    return packed_from(made, styles=styles)
+
+
 def tiny_packed(mirror_styles=("calm",)) -> PackedMotion:
     """Five clips of two styles: three for training, one each to validate and to test."""
     return packed_from(

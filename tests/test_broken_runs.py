@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import subprocess
 import sys
 import types
@@ -15,7 +14,6 @@ import pytest
 from builders import HISTORY, WINDOW, refused, tiny_packed, tiny_task
 
 from f3amd_companion import __main__ as command_line
-from f3amd_lib.ground import trees
 from f3amd_lib.ground.files import locked
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import kept_rows, read_table, write_table
@@ -127,15 +125,6 @@ def test_a_lock_is_free_once_its_process_is_killed(tmp_path):
         process.wait()
     with locked(lock, "work"):
         pass
-
-
-def test_weights_can_be_read_by_whom_the_umask_says(tmp_path):
-    before = os.umask(0o027)
-    try:
-        trees.save_tree(tmp_path / "weights.safetensors", {"a": jnp.ones(3)}, {})
-    finally:
-        os.umask(before)
-    assert (tmp_path / "weights.safetensors").stat().st_mode & 0o777 == 0o640
 
 
 @pytest.mark.parametrize(("command", "goes_on"), [("presets", False), ("train", True)])

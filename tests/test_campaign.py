@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import pandas as pd
 import pytest
-from builders import packed_from, refused
+from builders import refused, walks_of
 
 from f3amd_companion.__main__ import UNFINISHED, main
 from f3amd_companion.measuring import campaign, measure
@@ -22,7 +22,6 @@ from f3amd_lib.ground.records import read_table
 from f3amd_lib.measures.classifier import train_classifier
 from f3amd_lib.measures.denoising import held_out_condition, held_out_error, input_use
 from f3amd_lib.measures.protocol import Protocol
-from f3amd_lib.motion.synthetic import synthesize
 from f3amd_lib.networks import presets
 from f3amd_lib.training import checkpoints
 from f3amd_lib.training.pipeline import PreparedData
@@ -33,11 +32,7 @@ PROFILE = load_profile("smoke", "synthetic")
 
 @pytest.fixture(scope="module")
 def packed():
-    splits = (0, 0, 1, 2, 2)
-    return packed_from(
-        [(synthesize(s, 4.0, k), n, split) for n, s in enumerate(STYLES) for k, split in enumerate(splits)],
-        styles=STYLES,
-    )
+    return walks_of(STYLES)
 
 
 @pytest.fixture(scope="module")

@@ -640,18 +640,6 @@ def test_snapshots_of_the_queue_are_learning_curves(tmp_path):
         assert "quality_by_epoch.csv has no " in judged(name, fast, other).ours[0].figure, name
 
 
-@pytest.mark.parametrize(("skates", "verdict"), [((FNO, 64), UNJUDGED), ((CAMDM, 64), HOLDS)])
-def test_a_network_has_to_walk_with_the_window_that_it_is_judged_with(tmp_path, skates, verdict):
-    """Q4 says that CAMDM fails with 64 frames, and so that one need not walk."""
-    walking = trained([(name, window) for name in (FNO, CAMDM) for window in (32, 64)])["walking"]
-    walking = [
-        row | {"slide_speed": 90.0} if (row["model"], row["window_frames"]) == skates else row for row in walking
-    ]
-    statements = [s for s in judge(keep(tmp_path, world(True) | {"walking": walking}), "Q4").ours if s.verdict]
-    about = statements[skates[0] == CAMDM]
-    assert about.verdict == verdict and (skates[0] in about.reasons.get("does not walk", ())) == (verdict == UNJUDGED)
-
-
 # ---------------------------------------------------------------------------- intervals of times
 
 

@@ -48,16 +48,6 @@ def test_one_that_agrees_with_itself_everywhere_has_no_loss_and_another_has(task
     assert float(sample(task.teacher)) > 1e-3
 
 
-def test_identity_names_the_teacher(task):
-    other = dataclasses.replace(task, teacher=jax.tree.map(jnp.zeros_like, task.teacher))
-    assert task.identity()["teacher"] != other.identity()["teacher"]
-    assert task.identity()["training"] == other.identity()["training"]
-    levels = ConsistencyTask(
-        tiny_task(num_steps=8, diffusion=variance_preserving_cosine(8)), task.teacher, num_phases=2
-    )
-    assert levels.identity()["teacher"] != dataclasses.replace(levels, num_phases=4).identity()["teacher"]
-
-
 @pytest.mark.parametrize(("num_phases", "after"), [(1, [8] * 8), (2, [4] * 4 + [8] * 4), (4, [2, 2, 4, 4, 6, 6, 8, 8])])
 def test_a_question_ends_where_its_phase_does_and_the_sampler_asks_there(task, num_phases, after, monkeypatch):
     levels = variance_preserving_cosine(8)

@@ -152,18 +152,6 @@ def test_characters_start_in_a_fitting_pose_on_their_path(still, tmp_path):
 # --- paths -------------------------------------------------------------------------------------
 
 
-def test_paths_of_some_are_a_part_of_the_paths_of_all(monkeypatch):
-    pace = np.linspace(0.4, 4.0, 40)
-    for names in (PATHS, ("complex",)):
-        monkeypatch.setattr(crowds, "PATHS", names)
-        everybody = crowd_paths(range(40), pace, 20, 3)
-        some = crowd_paths(range(17, 29), pace[17:29], 20, 3)
-        other = crowd_paths(range(40), pace, 20, 4)
-        for whole, part, else_where in zip(everybody, some, other, strict=True):
-            np.testing.assert_array_equal(whole[17:29], part)
-            assert np.abs(whole - else_where).max() > 0.1
-
-
 @pytest.mark.parametrize("name", PATHS)
 def test_paths_are_walked_at_the_pace_with_the_turns_of_a_walk(name, monkeypatch):
     pace = np.array([0.5, 1.2, 4.0])

@@ -118,13 +118,10 @@ def test_what_makes_no_sense_is_refused():
         ({"coarse_levels": (300, 8)}, "coarse_levels must be as many numbers .*, got .300, 8."),
         ({"channels": (6,)}, "channels must be as many numbers"),
         ({"around": (5, 0)}, "each of around must be above 0"),
-        ({"up": (3, 9)}, "up must be as many numbers .*, got .3, 9."),
     ):
         with pytest.raises(ValueError, match=words):
             MeshAutoencoderConfig(num_vertices=252, **(SIZES | changes))
     network = MeshAutoencoder(CONFIG, rngs=nnx.Rngs(0))
     with pytest.raises(ValueError, match=r"vertices must be \[N, 252, 3\]"):
         network.encode(VERTICES[:, 1:], MESH.lists)
-    with pytest.raises(ValueError, match=r"latent must be \[N, 8, 5\]"):
-        network.decode(jnp.zeros((2, 8, 4)), MESH.lists)
     assert MeshAutoencoderConfig.from_dict(CONFIG.to_dict()) == CONFIG

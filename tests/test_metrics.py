@@ -255,19 +255,6 @@ def test_camdm_constant_wrong_facing_is_an_orientation_error():
     assert metrics.camdm_orientation_error(yaw + 6 * np.pi, np.zeros(4 * WINDOW)) == pytest.approx(10.0)
 
 
-def test_camdm_metrics_and_the_place_and_turn_of_the_world():
-    """All may be moved; turned, only those without angles, as the text of the angles says."""
-    positions, angle, shift = wobble(), 1.1, np.array([5.0, 0.0, -3.0])
-    path = named_path("slalom", len(positions))
-    before = metrics.camdm_metrics(positions, path, SKELETON)
-    moved = metrics.camdm_metrics(positions + shift, placed(path, shift[[0, 2]], path.yaw[0]), SKELETON)
-    assert moved == pytest.approx(before)
-    turned = positions @ matrix_from_yaw(np.float64(angle)).T
-    after = metrics.camdm_metrics(turned, placed(path, (0, 0), angle), SKELETON)
-    for key in ("camdm_foot_sliding", "coherence"):
-        assert after[key] == pytest.approx(before[key])
-
-
 # ------------------------------------------------------------------------------------- all together
 
 

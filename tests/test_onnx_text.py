@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from builders import stirred
 from flax import nnx
 
 from f3amd_companion.__main__ import main
@@ -29,10 +30,7 @@ SIZES = {"window": 4, "channels": 3, "latent_width": 16, "depth": 3, "num_heads"
 
 def weights_of(network):
     """Weights of a network, away from the zeros that some begin with."""
-    draw = np.random.default_rng(0)
-    return jax.tree.map(
-        lambda leaf: leaf + 0.1 * jnp.asarray(draw.normal(size=leaf.shape), leaf.dtype), nnx.state(network)
-    )
+    return nnx.state(stirred(network, scale=0.1))
 
 
 def acmdm(**changes) -> TextModel:

@@ -8,7 +8,6 @@ import pytest
 from f3amd_lib.diffusion.oracles import GaussianMixture
 from f3amd_lib.diffusion.schedules import variance_preserving_betas
 from f3amd_lib.text.phases import (
-    LATENT_CONSISTENCY_TIMES,
     consistency_answer,
     consistency_scales,
     cut_phases,
@@ -20,7 +19,6 @@ from f3amd_lib.text.phases import (
     latent_consistency_end,
     noise_travel,
     pseudo_huber,
-    sample_latent_consistency,
     shares,
     target_end,
 )
@@ -251,17 +249,6 @@ def test_a_walk_is_its_jumps_and_draws_no_noise():
     error = lambda steps: np.abs(follow(exact_noise, SCHEDULE, noise, ddim_times(1000, steps)) - exact).mean()
     exact = exact_flow(noise, 999, 0)
     assert error(50) < error(10) < error(2) and error(50) < 0.05
-
-
-def test_latent_consistency_samples_with_fresh_noise():
-    noise, key = normal(3, 512, 1), jax.random.key(0)
-    draw = lambda steps, key: sample_latent_consistency(
-        exact_noise, SCHEDULE, noise, LATENT_CONSISTENCY_TIMES[steps], key
-    )
-    np.testing.assert_array_equal(draw(1, key), draw(1, jax.random.key(1)))
-    assert np.abs(draw(2, key) - draw(2, jax.random.key(1))).max() > 0.1
-    # Told the conditional mean, one step returns to the middle, and four steps spread out again.
-    assert draw(1, key).std() < draw(4, key).std()
 
 
 def test_a_perfect_target_answers_with_the_end_of_the_path_and_a_mean_does_not():

@@ -11,7 +11,6 @@ from f3amd_lib.drawing.pictures import crowd_colors, crowd_figure, poses_beside
 from f3amd_lib.drawing.stick_figures import Camera, drawn_points
 from f3amd_lib.drawing.style import keep_figure, new_figure
 from f3amd_lib.motion.skeleton import Motion
-from f3amd_lib.motion.synthetic import synthesize
 
 # --- the camera --------------------------------------------------------------------------------
 
@@ -62,20 +61,6 @@ def test_a_crowd_is_shown_whole():
     assert left < drawn[:, 0].min() and drawn[:, 0].max() < right
     assert low < drawn[:, 1].min() and drawn[:, 1].max() < high
     assert drawn[:, 0].max() - drawn[:, 0].min() > 0.8 * (right - left)  # and no room is wasted
-
-
-def test_footprints_are_dots_under_feet_that_stand_and_strokes_under_feet_that_slide():
-    walk = synthesize("Neutral", seconds=3.0)
-    glide = walk.root_position.copy()
-    glide[:, [0, 2]] += np.outer(np.arange(len(glide)) / 30.0, [0.0, 0.5])  # half a metre a second
-    length = {}
-    for name, motion in (("stands", walk), ("slides", walk.replace(root_position=glide))):
-        axis = crowd_figure({"": ([motion], ["#542788"])}, 60).axes[0]
-        prints = [line.get_xydata() for line in axis.lines]
-        steps = np.concatenate([np.linalg.norm(np.diff(line, axis=0), axis=1) for line in prints])
-        assert len(prints) == 2 and np.isnan(steps).any()  # a foot each, with gaps where it swings
-        length[name] = np.nansum(steps)
-    assert length["slides"] > 2.0 * length["stands"]
 
 
 # --- diagrams ----------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pandas as pd
 import pytest
-from builders import packed_from, refused
+from builders import refused, walks_of
 from flax import nnx
 
 from f3amd_companion.measuring import measure
@@ -46,15 +46,7 @@ SMALL = Protocol(STYLES, num_frames=96, num_seeds=2, num_diversity_seeds=2, wind
 
 @pytest.fixture(scope="module")
 def packed():
-    splits = (0, 0, 1, 2, 2)
-    return packed_from(
-        [
-            (synthesize(style, 4.0, seed), number, split)
-            for number, style in enumerate(STYLES)
-            for seed, split in enumerate(splits)
-        ],
-        styles=STYLES,
-    )
+    return walks_of(STYLES)
 
 
 @pytest.fixture(scope="module")

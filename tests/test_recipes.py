@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pandas as pd
 import pytest
-from builders import HISTORY, WINDOW, packed_from, refused, tiny_camdm, tiny_trained, wandering_motion
+from builders import HISTORY, WINDOW, packed_from, tiny_camdm, tiny_trained, wandering_motion
 
 from f3amd_companion.measuring import campaign, measure
 from f3amd_lib.diffusion.schedules import variance_preserving_cosine
@@ -50,52 +50,6 @@ def test_every_recipe_changes_one_thing(prepared):
     assert plus.own_history_share == presets.find_preset("F3AMD-FNO-96-plus").training[
         "own_history_share"
     ]  # fmt: skip
-
-
-def test_two_changes_in_one_recipe_are_both_made(prepared):
-    both = campaign.find_recipe("residual-prior+higher-learning-rate")
-    one, other = (campaign.RECIPES[name] for name in both.name.split("+"))
-    assert (both.network, both.training) == (one.network, other.training)
-    assert both.config(100, 8, 0) == other.config(100, 8, 0)
-    assert prepared.model_config(both.preset, num_kept_modes=5, **both.network).residual_prior
-    assert one.change in both.change and other.change in both.change
-    for name in ("log-normal-noise+mixed-noise", "residual-prior+plus"):
-        refused("change the same thing, or start from unlike networks", campaign.find_recipe, name)
-
-
-@pytest.fixture
-def two_recipes(monkeypatch):
-    """Two rows only, on networks of one narrow block."""
-    build = presets.build_config
-    monkeypatch.setattr(
-        presets,
-        "build_config",
-        lambda *a, **k: build(*a, **{**k, "depth": 1, "latent_width": 8, "num_kept_modes": WINDOW // 2 + 1}),
-    )
-    rows = {name: campaign.RECIPES[name] for name in ("paper", "residual-prior")}
-    monkeypatch.setattr(measure, "RECIPES", rows)
-    monkeypatch.setattr(measure, "RECIPE_STEPS", {"smoke": 2})
-    return rows
-
-
-@pytest.mark.slow
-def test_recipes_are_trained_measured_and_gone_on_with(prepared, two_recipes, tmp_path, monkeypatch):
-    monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path))
-    monkeypatch.setattr(measure, "runs_dir", lambda *names: tmp_path.joinpath("runs", *names))
-    path = measure.measure_recipes(prepared, PROFILE)
-    table, record = read_table(path)
-    assert record["num_steps"] == 2 and record["batch_size"] == 2
-    assert list(table["recipe"]) == ["paper", "paper", "residual-prior", "residual-prior"]
-    assert list(table["steps"]) == [8, 1, 8, 1]
-    assert np.isfinite(table.select_dtypes("number")).all().all()
-    assert set(table["change"]) == {recipe.change for recipe in two_recipes.values()}
-    assert table["weights"].nunique() == 2
-    folder = tmp_path / "runs" / "synthetic" / "smoke" / "recipes" / "paper"
-    assert list(folder.glob("F3AMD-FNO-96*.history.csv"))
-
-    monkeypatch.setattr(measure, "train", lambda *a, **k: 1 / 0)
-    assert measure.measure_recipes(prepared, PROFILE) == path, "a row that is there was trained again"
-    refused("leave --model out", measure.measure_recipes, prepared, PROFILE, ["F3AMD-FNO-96"])
 
 
 @pytest.mark.slow

@@ -178,28 +178,6 @@ def test_tables_of_the_papers_are_whole_and_their_own_rows_have_presets(paper, n
     assert {find_preset(name).paper for name in own} <= {paper}
 
 
-def test_motionpcms_one_step_row_is_the_same_in_three_tables():
-    for number, model in (("1", "MotionPCM (1-step)"), ("2", "MotionPCM k=100"), ("4", "MotionPCM (1 step)")):
-        frame = papers.load_paper_table(number, "motionpcm")
-        rows = frame[(frame["model"] == model) & (frame.get("dataset", "HumanML3D") == "HumanML3D")]
-        printed = rows.set_index("metric")["printed"]
-        assert (printed["FID"], printed["R_precision_top1"], printed["MM_dist"]) == ("0.044", "0.560", "2.711")
-
-
-def test_the_headline_row_is_the_same_in_every_table():
-    def row(number, model):
-        frame = papers.load_paper_table(number)
-        chosen = frame[(frame["model"] == model) & (frame["window_frames"] == 32) & (frame["steps"] == 8)]
-        shared = chosen[~chosen["metric"].str.startswith("synthesis")]
-        return dict(zip(shared["metric"], shared["printed"], strict=True))
-
-    first = row(3, "F3AMD-FNO-96")
-    assert first["IRD"] == "1.795" and first["style_coverage"] == "93.980" and len(first) == 9
-    its_name = {9: " (FNO enc/dec)", 10: ", m=17", 11: " (FiLM)"}
-    for number in (5, 8, 9, 10, 11, 12):
-        assert row(number, "F3AMD-FNO-96" + its_name.get(number, "")) == first, number
-
-
 # ------------------------------------------------------------------------------------- tables
 
 

@@ -51,15 +51,6 @@ def test_eq09_uniform_spacing_by_hand():
     np.testing.assert_allclose(HAND.grid(4, "uniform"), [8.0, 1.75**3, 1.5**3, 1.25**3, 0.0], rtol=1e-14)
 
 
-@pytest.mark.parametrize("spacing", ["endpoints", "uniform"])
-@pytest.mark.parametrize("num_steps", [1, 2, 8, 100])
-def test_grids_fall_strictly_from_sigma_max_to_zero(num_steps, spacing):
-    grid = variance_exploding().grid(num_steps, spacing)
-    assert grid[0] == pytest.approx(128.0, rel=1e-14)
-    assert grid.dtype == np.float64 and grid.shape == (num_steps + 1,)
-    assert grid[-1] == 0.0 and np.all(np.diff(grid) < 0)
-
-
 def test_eq09_training_draws_t_uniformly():
     schedule, key = variance_exploding(), jax.random.key(4)
     drawn = schedule.draw(key, (5, 3))

@@ -103,13 +103,6 @@ def test_every_public_module_is_on_one_page_of_the_library():
     assert public <= set(shown)
 
 
-def test_every_data_set_has_a_gallery_page_that_inserts_it():
-    for folder in pages.result_folders():
-        page = DOCS / "gallery" / f"{folder.parent.name}.md"
-        assert page.is_file(), f"{folder.parent.name}: add docs/gallery/{page.name}"
-        assert ("gallery", folder.parent.name) in pages.INSERT.findall(page.read_text(encoding="utf-8"))
-
-
 @pytest.mark.parametrize("dataset", ["bandai", "synthetic"])
 def test_a_gallery_shows_every_figure_with_words_licence_and_notebook(dataset):
     text = pages.gallery_markdown(dataset)

@@ -11,23 +11,26 @@ import subprocess
 from types import SimpleNamespace
 
 import builders
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from builders import refused
-from steering_oracle import Steering, Target, first_pose, move_target
+from steering_oracle import FPS, Steering, Target, first_pose, move_target
 
 from f3amd_companion.serving import steer
 from f3amd_companion.serving.foot_locking import leg_chains, lock_frame, start_feet
 from f3amd_companion.serving.onnx_export import model_card
 from f3amd_companion.serving.player import FOLDER
-from f3amd_companion.serving.steer import package_file, steer_page, write_steer
+from f3amd_companion.serving.steer import package_file, steer_page, usual_walk, write_steer
 from f3amd_lib.data.features import frame_positions, orthonormalise, world_frames
 from f3amd_lib.diffusion.samplers import sample
 from f3amd_lib.diffusion.schedules import variance_exploding
 from f3amd_lib.motion.skeleton import describe_skeleton
 from f3amd_lib.motion.synthetic import SYNTHETIC_SKELETON, synthesize
 from f3amd_lib.rollout.blending import blend_seams
+from f3amd_lib.rollout.rollout import MotionGenerator
+from f3amd_lib.rollout.start_poses import pose_speed
 
 SIGMAS = variance_exploding().grid(3)
 BUNDLE = b"var a=1,b=import.meta.url;export{a as InferenceSession,b as default};\n//# sourceMappingURL=x"
@@ -199,6 +202,43 @@ def test_the_page_draws_standard_normal_numbers(tmp_path):
     assert abs(numbers.mean()) < 0.03 and abs(numbers.std() - 1) < 0.02 and abs((numbers**4).mean() - 3) < 0.3
     assert abs(np.corrcoef(numbers[1:], numbers[:-1])[0, 1]) < 0.03
     assert drawn[1] != drawn[0][:5]
+
+
+# ---------------------------------------------------------------------------- the oracle itself is a rollout
+
+
+@pytest.fixture(scope="module")
+def generator(trained):
+    return MotionGenerator(trained, 2)
+
+
+def start(generator, batch=2, **settings):
+    poses = [first_pose(generator.trained, "calm", (k, 0.5), 0.3) for k in range(batch)]
+    return Steering(generator, np.stack(poses), np.full(batch, 0.3), **settings)
+
+
+def test_whole_windows_without_blending_are_a_rollout(generator):
+    """The same frame, normaliser, path and style reach the network as in `MotionGenerator.generate`."""
+    window = generator.trained.config.window
+    steering = start(generator, hop=window, blend_frames=0)
+    speed, direction = np.full(2, 1.1), np.full(2, 0.3)
+    steering.target = steering.target._replace(speed=speed)  # at full speed and straight from the first frame on
+    history, (_, positions, headings) = steering.history, move_target(steering.target, speed, direction, window)
+    key = jax.random.key(3)
+    config = generator.trained.config
+    noise = jax.random.normal(jax.random.split(jax.random.fold_in(key, 0))[0], (2, window, config.channels))
+    made = steering.advance(speed, direction, np.eye(2), noise)
+    wanted = generator.generate(positions, headings, np.array([0, 1]), history, key)
+    np.testing.assert_allclose(made, wanted, atol=2e-5)
+    other = start(generator, hop=window, blend_frames=0).advance(speed, direction, np.eye(2)[::-1], noise)
+    assert np.abs(other - wanted).max() > 1e-3  # another style would be seen
+
+
+def test_a_style_starts_about_as_fast_as_it_usually_walks(generator):
+    starts = np.asarray(generator.trained.start_poses["calm"], np.float64)
+    pace, pose = usual_walk(generator.trained, "calm")
+    gap = np.abs(FPS * pose_speed(starts) - pace)
+    assert 0.3 < pace < 3.0 and np.abs(FPS * pose_speed(pose[None])[0] - pace) == gap.min()
 
 
 # --------------------------------------------------------------------------------------------------- the page as text

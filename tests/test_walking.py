@@ -6,7 +6,6 @@ from builders import SKELETON, refused, wandering_motion
 
 from f3amd_lib.ground.profiles import SHOWN_STYLES
 from f3amd_lib.measures import walking
-from f3amd_lib.measures.registry import METRICS
 from f3amd_lib.motion.root_paths import named_path
 from f3amd_lib.motion.synthetic import style_parameters, synthesize, walk_along
 
@@ -146,16 +145,3 @@ def test_a_stiff_figure_swings_nothing_however_it_turns():
     turning = np.einsum("tab,tjb->tja", turn, frozen)
     assert walking.bone_swing(turning, SKELETON) == pytest.approx(0.0, abs=1e-4)
     assert walking.bone_swing(motion.positions, SKELETON) > 5.0
-
-
-def test_checks_pass_within_the_factor_and_not_beyond():
-    real = {METRICS[name].key: np.array([1.0, 3.0]) for name in walking.FACTORS}
-    near = {METRICS[name].key: np.array([2.0]) * 0.99 * f for name, f in walking.FACTORS.items()}
-    far = {METRICS[name].key: np.array([2.0]) * 1.01 * f for name, f in walking.FACTORS.items()}
-    low = {METRICS[name].key: np.array([2.0]) / 1.01 / f for name, f in walking.FACTORS.items()}
-    table = walking.walking_checks(real, {("near", 8): near, ("far", 8): far, ("low", 1): low})
-    passed = table.groupby("label")["within"].agg(["all", "any"])
-    assert passed.loc["near, 8 steps"].tolist() == [True, True]
-    assert passed.loc["far, 8 steps"].tolist() == [False, False]
-    assert passed.loc["low, 1 step"].tolist() == [False, False]
-    assert set(table["real"]) == {2.0}
