@@ -1,9 +1,10 @@
-"""The bimodal toy: its exact denoiser against brute force, its paths, what training gives."""
+"""The bimodal toy: its exact denoiser against brute force, its paths, and the ways past the wall in one step."""
 
 import jax
 import numpy as np
 import pytest
 from f3amd_notebooks import bimodal_paths as toy
+from f3amd_notebooks import one_step_ways as ways
 from f3amd_notebooks.bimodal_paths import BimodalPaths
 
 from f3amd_lib.diffusion import samplers
@@ -98,27 +99,21 @@ def test_exact_one_step_hits_the_wall_eight_choose_and_a_given_side_needs_no_cho
 # ------------------------------------------------------------------------------------- networks
 
 
-SHORT = {"num_steps": 400, "batch_size": 16, "learning_rate": 8e-3, "latent_width": 8, "depth": 1}
+# ------------------------------------------------------------------------------- ways in one step
 
 
-@pytest.fixture(scope="module")
-def trained():
-    networks, losses = toy.train_networks(SMALL, PRESERVING, (0, 1), **SHORT)
-    return networks[0], losses[0], losses[1]
+def test_real_paths_have_all_their_variety_and_a_mean_has_none():
+    paths, _ = SMALL.draw(jax.random.key(5), 2000)
+    real = ways.end_figures(SMALL, paths)
+    assert real["wall"] == 0.0 and real["variety"] == pytest.approx(1.0, abs=0.1)
+    means = np.repeat(SMALL.mean_paths, 10, axis=0)
+    assert ways.end_figures(SMALL, means)["variety"] == pytest.approx(0.0, abs=1e-9)
+    middle = np.repeat(SMALL.mean_paths.mean(axis=0)[None], 10, axis=0)
+    hit = ways.end_figures(SMALL, middle)
+    assert hit["wall"] == 1.0 and np.isnan(hit["variety"])
 
 
-@pytest.mark.slow
-def test_a_short_training_learns_the_mean_and_the_sides(trained):
-    network, losses, _ = trained
-    assert losses.shape == (400,) and losses[-50:].mean() < 0.2 * losses[:5].mean()
-    table = toy.outcome_table(network, PRESERVING, (1,), num_samples=200).set_index("told")
-    assert table.loc[False, "wall"] > 0.95
-    assert table.loc[True, "as_told"] > 0.95
-
-
-@pytest.mark.slow
-def test_a_trained_network_comes_near_the_exact_error_and_not_below(trained):
-    sigmas = PRESERVING.levels[[3, 5, 7]]
-    found = toy.error_table(trained[0], sigmas, num_samples=1000)["x0_error"]
-    exact = toy.error_table(SMALL, sigmas, num_samples=1000)["x0_error"]
-    assert (found > 0.995 * exact).all() and (found < 1.3 * exact + 0.1).all()
+def test_the_exact_mean_hits_the_wall_and_the_exact_walk_does_not():
+    compared = {"one": ([SMALL], 1), "eight": ([SMALL], 8)}
+    table = ways.ways_table(compared, EXPLODING, num_samples=200).set_index("way")
+    assert table.loc["one", "wall"] > 0.95 and table.loc["eight", "wall"] < 0.1

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import subprocess
 import sys
-import types
 
 import jax.numpy as jnp
 import numpy as np
@@ -137,16 +136,3 @@ def test_ctrl_c_ends_in_one_line(monkeypatch, capsys, command, goes_on):
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1 and lines[0].startswith(f"f3amd {command}: stopped")
     assert ("goes on" in lines[0]) == goes_on
-
-
-def test_held_out_losses_of_training_clips_are_not_silent(tmp_path, monkeypatch, caplog):
-    packed = tiny_packed()
-    object.__setattr__(packed, "clip_split", np.zeros(packed.num_clips, np.uint8))
-    prepared, task = PreparedData(packed, WINDOW, HISTORY), tiny_task()
-    monkeypatch.setattr(PreparedData, "task", lambda self, *args, **settings: task)
-    state = types.SimpleNamespace(step=0)
-    monkeypatch.setattr(pipeline, "optimise", lambda *args, **settings: (state, []))
-    with caplog.at_level(logging.WARNING, "f3amd"):
-        profile = load_profile("smoke", "synthetic")
-        assert pipeline.train(prepared, profile, config=task.config, folder=tmp_path)[0] is None
-    assert "no clip is held out" in caplog.text

@@ -8,7 +8,6 @@ import jax
 import numpy as np
 import pytest
 from builders import CHANNELS, HISTORY, SKELETON, WINDOW, refused, tiny_trained
-from scipy.spatial import cKDTree
 from test_rollout import obedient
 
 from f3amd_companion.serving import crowd as crowds
@@ -165,14 +164,6 @@ def test_paths_are_walked_at_the_pace_with_the_turns_of_a_walk(name, monkeypatch
     assert np.abs(wrap_angle(heading - middle)).max() < np.deg2rad(0.5)
     fastest = np.abs(np.diff(named_path(name, 2100).yaw)).max()
     assert np.abs(np.diff(yaw, axis=1)).max() <= fastest + 1e-9
-
-
-def test_starting_places_are_evenly_apart_in_crowds_of_any_size():
-    position, _ = crowd_paths(range(3000), np.ones(3000), 2, 0)
-    distance, _ = cKDTree(position[:, 0]).query(position[:, 0], k=2)
-    assert 1.5 < distance[1:, 1].min() and np.median(distance[:, 1]) < 2.0
-    # One character per pi square metres.
-    np.testing.assert_allclose(np.linalg.norm(position[:, 0], axis=-1).max() ** 2, 3000, rtol=1e-2)
 
 
 def test_a_perfect_network_follows_every_path_of_the_crowd(trained, tmp_path, monkeypatch):

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from builders import CHANNELS, WINDOW, draw, evaluate, make_condition, network_of, refused, tiny_camdm, tiny_config
+from builders import CHANNELS, WINDOW, draw, evaluate, make_condition, network_of, tiny_config
 
 from f3amd_companion.speed.fft_reference import fft_reference, fourier_transform_convolution, framework_convolution
 from f3amd_lib.networks.spectral import spectral_convolution
@@ -39,12 +39,3 @@ def test_the_network_by_fft_gives_the_same_answers(encoder_decoder):
     program = lambda form: str(jax.make_jaxpr(lambda x: form(x, 5.0, form.encode(given)))(x_noisy))
     assert "fft" in program(reference) and "conv_general" in program(reference)
     assert "fft" not in program(network) and "conv_general" not in program(network)
-
-
-@pytest.mark.parametrize(
-    "config",
-    [tiny_camdm(), tiny_config(base_block="transformer"), tiny_config(spectral_variant="cosine")],
-    ids=["CAMDM", "Transformer", "DCT"],
-)
-def test_networks_without_fourier_blocks_have_no_fft_reference(config):
-    refused("Fourier blocks", fft_reference, network_of(config))

@@ -3,7 +3,6 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from builders import refused
 
 from f3amd_lib.diffusion.oracles import GaussianMixture
 from f3amd_lib.diffusion.samplers import add_noise, ddim_step
@@ -71,15 +70,3 @@ def test_flow_is_where_fine_steps_lead_and_can_be_undone():
     exact = TWO.flow(x, 64.0, 0.01)
     np.testing.assert_allclose(state, exact, atol=5e-3)
     np.testing.assert_allclose(TWO.flow(exact, 0.01, 64.0), x, rtol=1e-9)
-
-
-def test_bad_mixtures_are_refused():
-    for bad in (
-        {"means": [0.0], "width": 0.0},
-        {"means": [0.0, 1.0], "width": 1.0, "weights": [1.0]},
-        {"means": [0.0, 1.0], "width": 1.0, "weights": [1.0, -1.0]},
-        {"means": [[np.nan]], "width": 1.0},
-    ):
-        with pytest.raises(ValueError):
-            GaussianMixture(**bad)
-    refused("D = 1", PLANE.flow, np.zeros((1, 2)), 1.0, 0.0)

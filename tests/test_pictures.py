@@ -7,7 +7,7 @@ import numpy as np
 from builders import wandering_motion
 from matplotlib.collections import LineCollection
 
-from f3amd_lib.drawing.pictures import crowd_colors, crowd_figure, poses_beside
+from f3amd_lib.drawing.pictures import crowd_figure, poses_beside
 from f3amd_lib.drawing.stick_figures import Camera, drawn_points
 from f3amd_lib.drawing.style import keep_figure, new_figure
 from f3amd_lib.motion.skeleton import Motion
@@ -38,18 +38,6 @@ def standing_at(x, z, seed=0, num_frames=20):
     motion = wandering_motion(num_frames, seed=seed)
     shift = np.array([x, 0.0, z]) - motion.root_position[10] * np.array([1.0, 0.0, 1.0])
     return motion.replace(root_position=motion.root_position + shift)
-
-
-def test_near_bodies_cover_far_ones_and_are_drawn_larger():
-    motions = [standing_at(2.0 * (k % 3), 2.5 * (k // 3), seed=k) for k in range(6)]
-    figure = crowd_figure({"Six\n1.0 ms a round": (motions, crowd_colors("abcabc"))}, 10)
-    outlines, fills = bodies(figure.axes[0])[::2], bodies(figure.axes[0])[1::2]
-    assert len(fills) == len(outlines) == 6  # drawn in this order: later ones cover earlier ones
-    widest = np.array([np.max(body.get_linewidths()) for body in fills])
-    assert widest[-1] > 1.2 * widest[0]
-    assert widest[-3:].min() > widest[:3].max()
-    for outline, fill in zip(outlines, fills, strict=True):
-        assert (np.array(outline.get_linewidths()) > np.array(fill.get_linewidths())).all()
 
 
 def test_a_crowd_is_shown_whole():

@@ -217,17 +217,6 @@ def test_titles_are_text_and_never_markup():
     assert label.startswith(evil)
 
 
-def test_boundaries_and_settings_are_handed_on():
-    motion = wandering_motion(FRAMES)
-    scene = Scene(motion, boundaries=range(8, FRAMES, 8))
-    data = page_data(player_page(scene, autoplay=False))
-    assert data["scenes"][0]["boundaries"] == [8, 16, 24, 32]
-    assert data["autoplay"] is False and data["follow"] is True
-    assert page_data(player_page(Scene([motion, motion])))["follow"] is False
-    assert page_data(player_page(Scene([motion, motion]), follow=True))["follow"] is True
-    assert data["around"] == pytest.approx(motion.yaw[0] - np.deg2rad(50), abs=1e-4)
-
-
 def test_a_rollout_becomes_a_scene():
     from f3amd_lib.data.features import world_frames
 

@@ -7,12 +7,10 @@ import numpy as np
 import pytest
 from builders import CHANNELS, WINDOW, network_of, refused, tiny_camdm, tiny_config
 
-from f3amd_companion.speed import implementations, measurements
+from f3amd_companion.speed import implementations
 from f3amd_companion.speed.implementations import NotPossible, Workload, prepare_round, random_condition
-from f3amd_companion.speed.measurements import PARTS, SUITES, Candidate, check_suites, plan, time_breakdown, time_group
+from f3amd_companion.speed.measurements import PARTS, SUITES, Candidate, check_suites, plan, time_group
 from f3amd_lib.diffusion.samplers import num_evaluations
-from f3amd_lib.ground.profiles import load_profile
-from f3amd_lib.ground.records import read_table
 from f3amd_lib.networks import presets
 from f3amd_lib.networks.conditioning import Condition
 from f3amd_lib.rollout.rounds import sample_round
@@ -100,51 +98,6 @@ def test_plans_name_presets_and_implementations_that_exist_each_once():
     refused("unknown suite", check_suites, ["bar"])
 
 
-@pytest.fixture
-def quick_suite(monkeypatch, tmp_path):
-    """A suite of two groups on tiny networks; returns how often each group was timed."""
-    monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path))
-    timed = []
-
-    def two_groups(suite):
-        one, two = (Candidate("F3AMD-FNO-96", 1, count, "jit", WINDOW) for count in (1, 2))
-        return {one.group: [one], two.group: [two, Candidate("CAMDM", 1, 2, "jit, FFT", WINDOW)]}
-
-    def counted(candidates, build_config, **settings):
-        timed.append(candidates[0].characters)
-        return time_group(candidates, tiny, **QUICK)
-
-    monkeypatch.setattr(measurements, "plan", two_groups)
-    monkeypatch.setattr(measurements, "time_group", counted)
-    return timed
-
-
-class Prepared:
-    class packed:
-        name, fingerprint, licence, credit = "synthetic", "abc", "none", "none"
-
-    model_config = staticmethod(lambda model, window: tiny(model))
-
-
-@pytest.mark.slow
-def test_measurement_writes_both_tables_and_goes_on_where_it_was(quick_suite):
-    profile = load_profile("smoke", "synthetic")
-    assert measurements.measure_synthesis_time(Prepared, profile, stop_at=0.0) is None and quick_suite == []
-    path = measurements.measure_synthesis_time(Prepared, profile)
-    assert quick_suite == [1, 2]
-    table, record = read_table(path)
-    assert list(table["characters"]) == [1, 2]
-    (reason,) = record["not_possible"].values()
-    assert "Fourier blocks" in reason
-    assert record["timed_on"]["cores"] >= 1 and record["turns"]["min_rounds"] == 10
-    measurements.measure_synthesis_time(Prepared, profile)
-    assert quick_suite == [1, 2]  # known, and known to be impossible
-    measurements.measure_synthesis_time(Prepared, profile, again=True)
-    assert quick_suite == [1, 2, 1, 2]
-    every, _ = read_table(path.with_name("synthesis_ways.csv"))
-    assert len(every) == 2
-
-
 def test_parts_are_left_out():
     network = network_of(tiny_config())
     given, x_noisy = Condition(*random_condition(network.config, 2)), np.zeros((2, WINDOW, CHANNELS), np.float32)
@@ -158,12 +111,3 @@ def test_parts_are_left_out():
         with mock.patch.object(*replaced):
             assert products() < whole
     assert products() == whole
-
-
-@pytest.mark.slow
-def test_time_of_parts_is_a_share_of_the_whole():
-    table = time_breakdown(workload(steps=1), **QUICK)
-    assert list(table["without"]) == ["nothing", *PARTS, "noise"]
-    whole = table["value"].iloc[0]
-    np.testing.assert_allclose(table["saved"].iloc[1:], 1 - table["value"].iloc[1:] / whole)
-    assert np.isnan(table["saved"].iloc[0])

@@ -14,7 +14,7 @@ from f3amd_lib.data.windows import gather_windows
 from f3amd_lib.diffusion.schedules import variance_exploding, variance_preserving_cosine
 from f3amd_lib.networks.conditioning import Condition
 from f3amd_lib.training import denoising_task
-from f3amd_lib.training.denoising_task import network_inputs, own_history_share
+from f3amd_lib.training.denoising_task import network_inputs
 from f3amd_lib.training.losses import LOSS_TERMS
 from f3amd_lib.training.optimise import held_out_terms, initial_state, optimise, restore_state, save_state
 from f3amd_lib.training.recipe import LossWeights, TrainingConfig, learning_rate_schedule, paper_recipe, short_recipe
@@ -207,16 +207,6 @@ def test_dropout_is_drawn_in_training_alone():
     with_dropout, _ = optimise(task, stop_after=2, **QUIET)
     without, _ = optimise(quiet, stop_after=2, **QUIET)
     assert largest_change(with_dropout.params, without.params) > 1e-6
-
-
-@pytest.mark.parametrize(
-    "num_steps, begins, full", [(100, 10, 40), (4_000, 400, 1_600), (151_533, 400, 1_600)], ids="short own long".split()
-)
-def test_a_long_run_starts_from_its_own_histories_as_soon_as_a_short_one(num_steps, begins, full):
-    # A snapshot of the long queue must be what a run of its own length would be.
-    config = TrainingConfig(num_steps, own_history_share=0.75)
-    shares = [float(own_history_share(config, step)) for step in (0, begins, (begins + full) // 2, full, num_steps)]
-    assert shares == pytest.approx([0.0, 0.0, 0.375, 0.75, 0.75], abs=1e-6)
 
 
 def test_batches_of_a_long_run_hold_own_histories_wherever_a_window_has_one_before():
