@@ -9,7 +9,7 @@ from builders import refused
 from f3amd_lib.data import packed as packed_module
 from f3amd_lib.data.packed import PackedMotion, cache_path, load_packed, pack, packed_dataset, save_packed
 from f3amd_lib.data.sources import SPLITS, Clip, Dataset
-from f3amd_lib.ground.trees import describe, save_tree
+from f3amd_lib.ground.trees import describe
 from f3amd_lib.motion.rotations import matrix_from_euler
 from f3amd_lib.motion.skeleton import Motion, Skeleton
 
@@ -115,17 +115,6 @@ def test_flipped_bits_and_altered_words_are_refused(packed, tmp_path):
     for altered in (data.replace(b"CC0", b"CC1"), data[:middle] + bytes([data[middle] ^ 0x55]) + data[middle + 1 :]):
         path.write_bytes(altered)
         refused(r"a\.safetensors: .*checksum", load_packed, path)
-
-
-def test_other_files_are_refused(packed, tmp_path):
-    path = tmp_path / "a.safetensors"
-    refused(r"a\.safetensors: no such", load_packed, path)
-    path.write_text("not a packed data set")
-    refused(r"a\.safetensors: not a whole", load_packed, path)
-    save_tree(path, {"root_position": np.zeros(3)}, {"kind": "trained model"})
-    refused(r"a\.safetensors: holds a trained model", load_packed, path)
-    save_tree(path, {"root_position": np.zeros(3)}, {"kind": packed_module._KIND})
-    refused(r"a\.safetensors: description lacks or garbles", load_packed, path)
 
 
 def test_one_skeleton_for_all(motions):

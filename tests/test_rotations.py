@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from f3amd_lib.motion import rotations
 
@@ -21,15 +22,7 @@ def elementary(axis: str, angle: float) -> np.ndarray:
 
 
 def random_matrices(count: int, seed: int = 0) -> np.ndarray:
-    """Rotations from unit quaternions, by the textbook formula."""
-    q = np.random.default_rng(seed).standard_normal((count, 4))
-    w, x, y, z = (q / np.linalg.norm(q, axis=-1, keepdims=True)).T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(rows), -1, 0)
+    return Rotation.random(count, random_state=seed).as_matrix()
 
 
 def test_6d_is_the_first_two_columns():
