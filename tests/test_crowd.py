@@ -283,6 +283,7 @@ def test_folders_with_other_things_are_left_alone(still, tmp_path):
     for overwrite in (False, True):
         refused(r"crowd.json: not written by this", generate_crowd, still, 2, 5, tmp_path, overwrite=overwrite)
     refused("thesis.txt: holds something else", generate_crowd, still, 2, 5, tmp_path / "thesis.txt")
+    assert sorted(item.name for item in tmp_path.iterdir()) == ["crowd.json", "thesis.txt"]
     assert (tmp_path / "thesis.txt").read_text() == "years of work"
 
 
