@@ -384,7 +384,7 @@ def test_quiet_leaves_warnings_alone(caplog, monkeypatch):
 
 @pytest.mark.parametrize("met, status", [(["yes", "not measured"], 0), (["yes", "no"], 1)])
 def test_a_missed_bar_is_the_status_of_bench(no_fast_flags, monkeypatch, tmp_path, met, status):
-    monkeypatch.setattr("f3amd_lib.training.pipeline.prepare", lambda profile, path: None)
+    monkeypatch.setattr("f3amd_lib.training.pipeline.prepare", lambda profile, **how: None)
     monkeypatch.setattr(measurements, "measure_synthesis_time", lambda *a, **k: tmp_path / "table.csv")
     monkeypatch.setattr("f3amd_lib.ground.records.read_table", lambda path: (None, {}))
     monkeypatch.setattr(speed_tables, "speed_bars", lambda table, suite: pd.DataFrame({"met": met}))

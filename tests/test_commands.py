@@ -150,6 +150,7 @@ def test_every_claim_has_a_command_that_the_ledger_prints():
 def test_a_command_is_understood(run, monkeypatch):
     """The words reach the measurement that is meant; nothing is measured."""
     called = []
+    monkeypatch.setattr("f3amd_companion.terminal.check_there", lambda *paths: None)
     monkeypatch.setattr("f3amd_lib.training.pipeline.prepare", lambda profile, **how: profile)
     for name in measure.MEASUREMENTS:
         note = lambda prepared, profile, models, name=name, **extra: (

@@ -114,15 +114,15 @@ def test_an_unknown_preset_stops_before_anything_is_trained(leg, tmp_path, capsy
 def test_the_command_tells_an_unfinished_leg_by_its_status(prepared, monkeypatch, caplog):
     def legs(finished):
         monkeypatch.setattr(pipeline, "finished_model", lambda prepared, profile, name, files: name in finished or None)
-        return main(["train", "--preset", "F3AMD-FNO-32", "--preset", "CAMDM", "--preset", "CAMDM-64"])
+        return main(["train", "--preset", "F3AMD-FNO-32", "--preset", "CAMDM", "--preset", "CAMDM-96"])
 
     caplog.set_level("INFO")
     monkeypatch.setattr(pipeline, "prepare", lambda *a, **k: prepared)
     monkeypatch.setattr(pipeline, "train", lambda *a, **k: (None, None))
-    assert legs({"F3AMD-FNO-32", "CAMDM", "CAMDM-64"}) == 0
+    assert legs({"F3AMD-FNO-32", "CAMDM", "CAMDM-96"}) == 0
     assert legs({"F3AMD-FNO-32"}) == 3
     assert "unfinished; what is done" in caplog.text and "CAMDM.state.safetensors" in caplog.text
-    assert "not begun    CAMDM-64\n" in caplog.text and "f3amd train --preset F3AMD-FNO-32 --preset" in caplog.text
+    assert "not begun    CAMDM-96\n" in caplog.text and "f3amd train --preset F3AMD-FNO-32 --preset" in caplog.text
 
 
 def test_a_measurement_without_weights_says_what_to_do(monkeypatch):
