@@ -38,7 +38,7 @@ def clean_estimate(objective: str, prediction, state, alpha, sigma):
 
 
 def on_grid(predict, objective: str, times, alphas, sigmas, levels=None) -> Denoiser:
-    """Return the denoiser of a network that is told times, on a walk that asks at places of its grid alone.
+    """Wrap a time-conditioned network as a denoiser, valid only at the grid's noise levels.
 
     Args:
       predict: `predict(state, time)`, the state alpha x0 + sigma eps.
