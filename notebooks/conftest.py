@@ -18,8 +18,9 @@ if f"jaxlib=={version('jaxlib')} " in (ROOT / "requirements.lock").read_text():
     # Half of the time that all optimisations take, and programs that run as fast.
     RUNNING += " --xla_backend_optimization_level=1 --xla_llvm_disable_expensive_passes=true"
 
-LONG_TRAININGS = (
-    "07_motion_quality", "10_printed_update", "10_rounds", "11_one_step", "22_one_step_three_ways",
+LONG_RUNS = (
+    "07_motion_quality", "10_printed_update", "10_rounds", "11_one_step", "14_crowd",
+    "22_one_step_three_ways",
 )  # fmt: skip
 """Notebooks that run longer than they compile."""
 
@@ -40,6 +41,6 @@ def pytest_collection_modifyitems(items):
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item):
     """Choose in the environment, which a notebook's kernel inherits before its first cell."""
-    is_long = item.path.stem in LONG_TRAININGS
+    is_long = item.path.stem in LONG_RUNS
     os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = str(int(not is_long))
     os.environ["XLA_FLAGS"] = RUNNING if is_long else QUICKLY
