@@ -24,10 +24,11 @@ PROGRAM = """
 import sys
 sys.path.insert(0, {tests!r})
 import jax, numpy as np
+from pathlib import Path
 import test_parallel as here
 from f3amd_lib.training.optimise import all_devices, optimise, restore_state
 assert len(jax.devices()) == 2, jax.devices()
-mesh, path, task = all_devices(), here.Path({out!r}) / "state.safetensors", here.task()
+mesh, path, task = all_devices(), Path({out!r}) / "state.safetensors", here.task()
 how = {{"checkpoint": path, "held_out": here.tiny_windows(), "chunk": 3, "mesh": mesh, "progress": False}}
 state, history = optimise(task, **how)
 assert int(restore_state(path, task, mesh).step) == here.STEPS
