@@ -90,10 +90,9 @@ class Person:
     def read(self, path: Path):
         """Read a file, and say what was corrected."""
         from f3amd_lib.motion.bvh import read_bvh
-        from f3amd_lib.motion.plausible import as_person, call_by_roles
+        from f3amd_lib.motion.plausible import as_person
 
-        motion = call_by_roles(read_bvh(path), self.mapped())
-        motion, notes = as_person(motion, scale=self.scale, up=self.up)
+        motion, notes = as_person(read_bvh(path), joint_map=self.mapped(), scale=self.scale, up=self.up)
         if notes:
             log.info("corrected    %s: %s", path, "; ".join(notes))
         return motion
@@ -174,11 +173,12 @@ class Model:
     @property
     def styles(self) -> list[str]:
         """Return the styles that the model knows, from the head of its file: JAX is not loaded."""
+        from safetensors import SafetensorError, safe_open
+
         try:
-            with self.file.open("rb") as file:
-                head = json.loads(file.read(int.from_bytes(file.read(8), "little")))
-            return list(json.loads(head["__metadata__"]["description"])["styles"])
-        except (OSError, LookupError, TypeError, ValueError, OverflowError):
+            with safe_open(self.file, framework="numpy") as file:
+                return list(json.loads(file.metadata()["description"])["styles"])
+        except (SafetensorError, OSError, LookupError, TypeError, ValueError):
             raise ValueError(f"{self.file}: no whole file of a model with styles") from None
 
     def style(self, asked: str) -> str:

@@ -40,7 +40,7 @@ from f3amd_lib.ground.names import check_known
 from f3amd_lib.ground.profiles import SHOWN_STYLES
 from f3amd_lib.motion import synthetic
 from f3amd_lib.motion.bvh import format_bvh, parse_bvh
-from f3amd_lib.motion.plausible import as_person, call_by_roles
+from f3amd_lib.motion.plausible import as_person
 from f3amd_lib.motion.retarget import retarget as put_on
 from f3amd_lib.motion.skeleton import Motion, resample
 
@@ -68,8 +68,7 @@ class Clip:
       content: what is done in it, such as "walk" or "FW"; may be empty.
       split: "train", "validation" or "test".
       loader: callable without arguments that returns the motion.
-      person: of a stranger's motion, joint_map of `call_by_roles` and what `as_person` takes; None for motion that we
-        know.
+      person: of a stranger's motion, what `as_person` takes; None for motion that we know.
     """
 
     name: str
@@ -87,8 +86,7 @@ class Clip:
         """Return what `load` does, and notes on what had to be corrected."""
         motion, notes = self.loader(), []
         if self.person is not None:
-            how = dict(self.person)
-            motion, notes = as_person(call_by_roles(motion, how.pop("joint_map")), **how)
+            motion, notes = as_person(motion, **self.person)
         return resample(motion, fps).replace(name=self.name), notes
 
 
@@ -132,8 +130,7 @@ def open_dataset(
       seconds_per_style: synthetic only: motion per style, shared out over several takes.
       num_styles: keep only so many styles (primary ones first, then by name); None keeps all.
       retarget: folder only: bring several people's motion to the skeleton of the first clip.
-      scale, up, keep_first: folder only, as in `as_person`.
-      joint_map: folder only, as in `call_by_roles`.
+      scale, up, keep_first, joint_map: folder only, as in `as_person`.
 
     Returns:
       The data set. Numbers are read by `Clip.load`.

@@ -3,9 +3,6 @@
 import logging
 from collections.abc import Sequence
 
-Broken = Sequence[tuple[str, str]]
-"""(record, reason) of each."""
-
 log = logging.getLogger("f3amd")
 
 MOST_BROKEN = 0.2

@@ -33,11 +33,15 @@ JUMP = 0.2
 _Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
-def as_person(motion: Motion, *, scale: float | None = None, up: str | None = None, keep_first: bool = False):
+def as_person(
+    motion: Motion, *, joint_map: Mapping[str, str] | None = None, scale: float | None = None, up: str | None = None,
+    keep_first: bool = False,
+) -> tuple[Motion, list[str]]:  # fmt: skip
     """Correct a stranger's motion that was read as centimetres with +Y up.
 
     Args:
       motion: with rotations or of positions alone.
+      joint_map: as `call_by_roles` takes it.
       scale: metres in the file's unit, instead of what the legs say.
       up: "Y" or "Z", instead of what legs and hips say.
       keep_first: keep a T-pose before the take.
@@ -48,6 +52,8 @@ def as_person(motion: Motion, *, scale: float | None = None, up: str | None = No
     Raises:
       ValueError: for legs that are a person's in no unit; names the option that overrules it.
     """
+    if joint_map:
+        motion = call_by_roles(motion, joint_map)
     if up is not None:
         check_known(up, ("Y", "Z"), "axis that is up")
     if scale is not None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -174,26 +174,24 @@ class TextMotions:
         Those stored with the data are taken as they are, so that a part of a motion faces as it does in the whole. Of
         those computed, a clip's last frame has no next one to step to: it is taken to go on as it moves.
         """
-        return np.concatenate(list(self._vectors(released)))
+        return _stacked(self._vectors(released))
 
     def essential_features(self, *, released: bool = True) -> np.ndarray:
         """Return what a judge sees of all frames, [N, 4 + 3 (J - 1)], float32; last frames as above."""
         each = lambda clip: redundant.essential_features(self.skeleton, clip, released=released)
-        features = map(each, self._going_on())
-        return np.concatenate([feature.astype(np.float32) for feature in features])
+        return _stacked(map(each, self._going_on()))
 
     def joint_features(self) -> np.ndarray:
         """Return what InterGen's representation adds to positions, of all frames, [N, J, 10]; last frames as above."""
         every = zip(self._going_on(), self._vectors(released=False), strict=True)
-        features = (redundant.joint_features(self.skeleton, clip, vectors) for clip, vectors in every)
-        return np.concatenate([feature.astype(np.float32) for feature in features])
+        return _stacked(redundant.joint_features(self.skeleton, clip, vectors) for clip, vectors in every)
 
     def _going_on(self) -> Iterator[np.ndarray]:
         """Yield the positions of each clip, and one frame more."""
         return (going_on(self.clip(number)) for number in range(self.num_clips))
 
     def _vectors(self, released: bool) -> Iterator[np.ndarray]:
-        """Yield the redundant vectors of each clip, float32."""
+        """Yield the redundant vectors of each clip."""
         stored = self.stored or [(None, 0)] * self.num_clips
         for (file, first), clip in zip(stored, self._going_on(), strict=True):
             vectors = [np.nan] if file is None else np.load(file, mmap_mode="r")[first : first + len(clip) - 1]
@@ -201,7 +199,12 @@ class TextMotions:
                 vectors = redundant.redundant_from_positions(
                     self.skeleton, clip, contact_step=self.contact_step, released=released
                 )
-            yield np.asarray(vectors, np.float32)
+            yield vectors
+
+
+def _stacked(clips: Iterable[np.ndarray]) -> np.ndarray:
+    """Return what clips have of each frame, one clip after the other, float32."""
+    return np.concatenate([np.asarray(clip, np.float32) for clip in clips])
 
 
 def going_on(positions) -> np.ndarray:
