@@ -138,7 +138,7 @@ class ACMDMConfig(CheckedConfig):
     def check_condition(self, condition: TextCondition) -> None:
         """Raise ValueError unless text and mask fit each other and the config."""
         pooled, mask = condition
-        if pooled.shape != (len(mask), self.text_width) or mask.ndim != 2 or not 0 < mask.shape[1] <= self.window:
+        if pooled.shape != (mask.shape[0], self.text_width) or mask.ndim != 2 or not 0 < mask.shape[1] <= self.window:
             wanted = f"[B, {self.text_width}], and its mask [B, at most {self.window} frames]"
             raise ValueError(f"pooled text must be {wanted}, got {pooled.shape} and {mask.shape}")
 
