@@ -5,9 +5,10 @@ import hashlib
 
 import numpy as np
 from builders import wandering_motion
+from f3amd_notebooks.drawings import poses_beside
 from matplotlib.collections import LineCollection
 
-from f3amd_lib.drawing.pictures import crowd_figure, poses_beside
+from f3amd_lib.drawing.pictures import crowd_figure
 from f3amd_lib.drawing.stick_figures import Camera, drawn_points
 from f3amd_lib.drawing.style import keep_figure, new_figure
 from f3amd_lib.motion.skeleton import Motion

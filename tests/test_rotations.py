@@ -62,7 +62,8 @@ def test_positive_yaw_turns_from_z_to_x(yaw_deg, facing):
 
 def test_yaw_comes_back_from_6d_and_from_direction():
     yaw = np.linspace(-3.1, 3.1, 41)
-    np.testing.assert_allclose(rotations.yaw_from_rotation_6d(rotations.rotation_6d_from_yaw(yaw)), yaw, atol=1e-12)
+    turned = rotations.rotation_6d_from_yaw(yaw)
+    np.testing.assert_allclose(np.arctan2(-turned[:, 2], turned[:, 0]), yaw, atol=1e-12)
     facing = rotations.matrix_from_yaw(yaw) @ np.array([0.0, 0.0, 2.5]) + [0.0, 7.0, 0.0]
     np.testing.assert_allclose(rotations.yaw_from_direction(facing), yaw, atol=1e-12)
 
@@ -98,7 +99,6 @@ def test_slerp_goes_the_short_way():
         (rotations.rotation_6d_from_matrix, (7, 3, 3)),
         (rotations.matrix_from_yaw, (7,)),
         (rotations.rotation_6d_from_yaw, (7,)),
-        (rotations.yaw_from_rotation_6d, (7, 6)),
         (rotations.yaw_from_direction, (7, 3)),
         (rotations.wrap_angle, (7,)),
     ],

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from f3amd_notebooks.clip_statistics import clip_statistics
 
-from f3amd_lib.data.features import clip_statistics, lowest_toe_height
+from f3amd_lib.data.features import lowest_toe_height
 from f3amd_lib.motion.rotations import matrix_from_yaw
 from f3amd_lib.motion.skeleton import Motion, Skeleton
 

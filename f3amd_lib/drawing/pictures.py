@@ -22,7 +22,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from f3amd_lib.drawing import stick_figures
 from f3amd_lib.drawing.stick_figures import Camera
-from f3amd_lib.drawing.style import PALETTE, model_style, new_figure, plot_style
+from f3amd_lib.drawing.style import PALETTE, new_figure, plot_style
 from f3amd_lib.ground.files import named_file, whole_file
 from f3amd_lib.motion.skeleton import Motion
 
@@ -122,7 +122,7 @@ def film_strip(motions, *, paths=None, titles=None, num_poses: int = 8, frames: 
     for (poses, plan), (motion, path, title) in zip(axes, rows, strict=True):
         last = motion.num_frames - 1
         chosen = np.linspace(0, last, count).round().astype(int) if frames is None else np.asarray(frames)
-        _draw_poses(poses, motion, chosen)
+        draw_poses(poses, motion, chosen)
         poses.set_title(title or " ")
         _draw_plan(plan, motion, chosen, path)
     # One scale for all rows, wide enough for the arms of the last pose.
@@ -145,7 +145,8 @@ def film_strip(motions, *, paths=None, titles=None, num_poses: int = 8, frames: 
 SLOT = 1.15  # metres of page a pose
 
 
-def _draw_poses(axis, motion: Motion, chosen, *, scale: float = 60.0, numbered: bool = True) -> None:
+def draw_poses(axis, motion: Motion, chosen, *, scale: float = 60.0, numbered: bool = True) -> None:
+    """Draw chosen frames side by side, `SLOT` apart, each from its own front right; scale: 1/72 inch a metre."""
     points = stick_figures.drawn_points(motion, chosen)
     yaw, touching = stick_figures.yaw_of(motion), _toes_down(motion, chosen)
     facing = np.zeros(len(chosen))
@@ -203,56 +204,6 @@ def frame_from_above(axis, points: np.ndarray, half: float) -> None:
     x, z = 0.5 * (points.min(axis=0) + points.max(axis=0))
     axis.set(xlim=(x + half, x - half), ylim=(z - half, z + half))
     axis.set_aspect("equal", adjustable="box")
-
-
-@plot_style()
-def poses_beside(
-    motions: Mapping[str, Motion | None], frames: Sequence[int], *, width: float = 7.2, below: float = 0.4
-):
-    """Draw the same frames of several motions, a panel each, timed poses side by side.
-
-    Every pose is seen from the character's own front right, wherever it goes.
-
-    Args:
-      motions: title -> motion, or None where a panel is to stay empty.
-      frames: which, in this order.
-      width: of the figure, inches.
-      below: room under the ground of each panel, metres, where a notebook may draw on; poses stand `SLOT` apart.
-    """
-    rows, panel = -(-len(motions) // 2), width / 2 - 0.15
-    # As high as its panels are at equal scale, and a line for the title.
-    inches = panel / (SLOT * len(frames))  # a metre
-    figure, axes = new_figure(width, (0.4 + inches * (1.85 + below)) * rows, rows, 2, squeeze=False)
-    for axis in axes.flat:
-        axis.axis("off")
-    for axis, (title, motion) in zip(axes.flat, motions.items(), strict=False):
-        if motion is not None:
-            _draw_poses(axis, motion, np.asarray(frames), scale=72 * inches, numbered=False)
-            axis.set_ylim(-below, 1.85)
-            axis.set_title(title, color=model_style(title).color)
-    return figure
-
-
-def draw_toes(figure, motions: Mapping[str, Motion | None], frames: range) -> None:
-    """Draw below each panel of `poses_beside` how high the toes are, thick where a toe rests.
-
-    Args:
-      figure: of `poses_beside(motions, frames, below=1.1)`.
-      motions, frames: the same; frames a range, and every one between its ends is drawn.
-    """
-    every = np.arange(frames[0], frames[-1] + 1)
-    along = SLOT * (every - frames[0]) / frames.step  # a time stands below its pose
-    for axis, motion in zip(figure.axes, motions.values(), strict=False):
-        if motion is None:
-            continue
-        height = motion.positions[every][:, list(motion.skeleton.toes), 1]
-        height = 4.0 * (height - height.min()) - 1.0  # four times as high, below the poses
-        for foot, side in enumerate(("left", "right")):
-            color = stick_figures.LIMB_COLORS[side]
-            axis.plot(along, height[:, foot], color=color, linewidth=0.9, label=f"{side} toe")
-            axis.plot(along, np.where(motion.contacts[every, foot], height[:, foot], np.nan), color=color, linewidth=3)
-    figure.axes[0].plot([], [], color=PALETTE["black"], linewidth=3, label="a toe rests")
-    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower left", ncols=3)
 
 
 # ------------------------------------------------------------------------------------------ crowds

@@ -8,7 +8,6 @@ from __future__ import annotations
 import hashlib
 import io
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,7 +16,6 @@ import matplotlib.style
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator
 from PIL import Image
 
 from f3amd_lib.ground.files import named_file, read_toml, write_whole
@@ -63,15 +61,6 @@ def model_style(name: str) -> ModelStyle:
     return ModelStyle(color, look.get("marker", _COLORS["markers"][width]), look.get("line", "-"))
 
 
-def system_line(label: str) -> dict:
-    """Return keyword arguments for `Axes.plot` of a model at some steps, "F3AMD-FNO-96, 8 steps".
-
-    One step is dotted, with open markers.
-    """
-    name, _, steps = label.partition(", ")
-    return model_style(name).line | ({"linestyle": ":", "markerfacecolor": "white"} if steps == "1 step" else {})
-
-
 def shades(count: int) -> list[tuple]:
     """Return dark to light shades of one colour, for curves in an order."""
     return [matplotlib.colormaps["viridis"](value) for value in np.linspace(0.05, 0.85, count)]
@@ -106,16 +95,6 @@ def new_figure(width: float = 7.0, height: float = 3.6, nrows: int = 1, ncols: i
         figure = Figure(figsize=(width, height))
         FigureCanvasAgg(figure)
         return figure, figure.subplots(nrows, ncols, **grid)
-
-
-def label_log_axis(axis, places: Sequence[float] = (1, 3)) -> None:
-    """Label a logarithmic axis (`axes.xaxis` or `axes.yaxis`) at these places of each decade, and nowhere else.
-
-    An axis that shows fewer than two of them is labelled at even steps by matplotlib.
-    """
-    axis.set_major_locator(LogLocator(subs=places))
-    axis.set_major_formatter("{x:g}")
-    axis.set_minor_formatter("")
 
 
 def save_figure(figure: Figure, path) -> Path:

@@ -81,12 +81,6 @@ def rotation_6d_from_yaw(yaw):
     return rotation_6d_from_matrix(matrix_from_yaw(yaw))
 
 
-def yaw_from_rotation_6d(rotation_6d):
-    """Return the yaw of a rotation about +Y given in 6D form, radians, [...]."""
-    xp = array_module(rotation_6d)
-    return xp.arctan2(-rotation_6d[..., 2], rotation_6d[..., 0])
-
-
 def yaw_from_direction(direction):
     """Return the yaw of a direction on the ground plane.
 
