@@ -6,6 +6,7 @@ file, line and remedy when a file is broken. Files hold centimetres and degrees;
 metres and rotation matrices.
 """
 
+import contextlib
 import io
 import logging
 import re
@@ -15,7 +16,6 @@ from pathlib import Path
 
 import numpy as np
 
-from f3amd_lib.ground.arrays import check_positive
 from f3amd_lib.ground.files import write_whole
 from f3amd_lib.motion.rotations import euler_from_matrix, matrix_from_euler
 from f3amd_lib.motion.skeleton import Motion, Skeleton
@@ -31,11 +31,13 @@ USUAL_RATES = (24, 25, 30, 48, 50, 60, 72, 90, 100, 120, 144, 150, 200, 240)
 LARGEST_NUMBER = 1e8
 """Largest number of a file, either way: 1,000 km in centimetres, and as many degrees."""
 
+_METRES = 0.01  # in a centimetre
+
 FRAME_TIMES = (1e-5, 1.0)
 """Shortest and longest time between frames, seconds."""
 
 _LONGEST_WORD = 200
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _BRACES = "check that every '{' has its '}'"
 
 _NAMED = r"[ \t]+([^\s{}][^\n{}]*+)\s*+\{", "a name on the same line, then '{'"
@@ -69,7 +71,7 @@ class _Broken(Exception):
 
 @dataclass
 class _Joint:
-    """What the HIERARCHY says of one joint; columns of the MOTION block by channel, such as "Xrotation"."""
+    """What the HIERARCHY says of one joint; offset in metres, columns of the MOTION block by channel ("Xrotation")."""
 
     name: str
     line: int
@@ -86,7 +88,7 @@ def read_bvh(path) -> Motion:
     """Read a BVH file in centimetres.
 
     Args:
-      path: of the file; its text from elsewhere, or in other units, is for `parse_bvh`.
+      path: of the file; its text from elsewhere is for `parse_bvh`.
 
     Returns:
       A `Motion` at the file's own frame rate, called by its path (see `parse_bvh`).
@@ -101,8 +103,8 @@ def read_bvh(path) -> Motion:
     return parse_bvh(content, str(path))
 
 
-def parse_bvh(text: str | bytes, name: str, scale: float = 0.01) -> Motion:
-    """Turn the text of a BVH file into a `Motion`.
+def parse_bvh(text: str | bytes, name: str) -> Motion:
+    """Turn the text of a BVH file in centimetres into a `Motion`.
 
     How channels are read:
       * Position channels replace OFFSET (they are not added to it). Below the root they must be
@@ -117,7 +119,6 @@ def parse_bvh(text: str | bytes, name: str, scale: float = 0.01) -> Motion:
       text: content of the file; line ends may be LF, CRLF, CR CR LF or CR, blanks may be tabs, names in Latin-1. Rows
         may be wrapped, and notes may stand in lines of their own in the HIERARCHY (#, // or ;) and after the rows.
       name: what messages and the motion call it.
-      scale: metres per unit of length in the file.
 
     Returns:
       A `Motion` in float64, metres, at the file's own frame rate.
@@ -125,7 +126,6 @@ def parse_bvh(text: str | bytes, name: str, scale: float = 0.01) -> Motion:
     Raises:
       ValueError: "name, line n: what is wrong; what to do" for anything that is not a sound BVH.
     """
-    check_positive("scale", scale)
     data = text.encode("utf-8", "surrogatepass") if isinstance(text, str) else text
     data = re.sub(rb"\r*\n|\r", b"\n", data) if b"\r" in data else data
     try:
@@ -141,7 +141,7 @@ def parse_bvh(text: str | bytes, name: str, scale: float = 0.01) -> Motion:
             raise _Broken(1 + data.count(b"\n"), "the file ends without a MOTION line; export or copy it again")
         joints, end_sites = _parse_hierarchy(_NOTE.sub("", hierarchy))
         values, frame_time = _parse_motion(data, motion.end(), joints)
-        return _build_motion(joints, end_sites, values, frame_time, name, scale)
+        return _build_motion(joints, end_sites, values, frame_time, name)
     except _Broken as error:
         raise ValueError("{}, line {}: {}".format(name, *error.args)) from None
 
@@ -181,11 +181,11 @@ def _offset(words: tuple[str, ...], line: int) -> list[float]:
     values = [finite_number(word) for word in words]
     if None in values:
         raise _Broken(line, f"OFFSET needs 3 finite numbers, found {' '.join(words)[:40]!r}{_comma(words[0])}")
-    return values
+    return [_METRES * value for value in values]
 
 
 def _parse_hierarchy(text: str) -> tuple[list[_Joint], list[tuple[int, list[float]]]]:
-    """Return the joints in file order and the End Sites as (joint, offset) in file units."""
+    """Return the joints in file order and the End Sites as (joint, offset)."""
     joints, taken, end_sites, column = [], {}, [], 0
     open_joints = []  # whose braces are open, innermost last
     for line, keyword, words in _statements(text):
@@ -252,52 +252,38 @@ def _parse_motion(data: bytes, place: int, joints: list[_Joint]) -> tuple[np.nda
     if "e" not in seconds.lower() and 0.5 * 10.0**-digits > 1e-3 * frame_time:
         usual = [1 / rate for rate in USUAL_RATES if round(1 / rate, digits) == round(frame_time, digits)]
         frame_time = min(usual, key=lambda time: abs(time - frame_time), default=frame_time)
-    rows, labels = (
-        data[head.end() :],
-        {n: f"{c} of {joint.name}" for joint in joints for c, n in joint.channels.items()},
-    )
-    values = _read_rows(rows, int(count), len(labels))
-    if values is not None:
-        return values, frame_time
-    # numpy's reader is fast, but its messages know no BVH: find out where and what.
-    frame = 0
-    for line, row in enumerate(rows.split(b"\n"), start=line_at(head.end())):
-        words = row.decode("utf-8", "replace").split()
-        for column, word in enumerate(words[: len(labels) + 1]):
-            if finite_number(word) is None:
-                place = f"number {column + 1} of frame {frame}, {labels.get(column, 'beyond the last channel')}"
-                how = f"is not a finite number of at most {LARGEST_NUMBER:g}{_comma(word)}"
-                raise _Broken(line, f"{word[:40]!r} ({place}) {how}; mend it or export again")
-        if words and len(words) != len(labels):
-            how = "cut off" if len(words) < len(labels) else "too long"
-            what = f"frame {frame} has {len(words)} numbers where the HIERARCHY has {len(labels)} channels"
-            raise _Broken(line, f"{what}: the row is {how}; export the file again")
-        frame += bool(words)
-    what = f"Frames: says {count}, but {frame} rows of numbers follow"
-    raise _Broken(line_at(head.start(1)), f"{what}; export the file again or mend the count")
-
-
-def _read_rows(rows: bytes, frames: int, channels: int) -> np.ndarray | None:
-    """Return numbers, [frames, channels], however rows are wrapped and whatever note follows; None for no fit."""
-    try:
+    labels = {column: f"{channel} of {joint.name}" for joint in joints for channel, column in joint.channels.items()}
+    rows, shape = data[head.end() :], (int(count), len(labels))
+    with contextlib.suppress(ValueError):  # UnicodeDecodeError is one, too
         if rows.strip():
             values = np.loadtxt(io.BytesIO(rows), dtype=np.float64, comments=None, ndmin=2, encoding="ascii")
-            if values.shape == (frames, channels) and (np.abs(values) <= LARGEST_NUMBER).all():
-                return values
-    except ValueError:  # UnicodeDecodeError is one, too
-        pass
-    values = []
-    for line in rows.decode("latin-1").splitlines():
-        numbers = [finite_number(word) for word in line.split()]
-        if len(values) < frames * channels:
-            values += numbers
-        elif numbers and numbers[0] is not None:
-            return None
-    fits = len(values) == frames * channels and None not in values
-    return np.reshape(np.array(values, np.float64), (frames, channels)) if fits else None
+            if values.shape == shape and (np.abs(values) <= LARGEST_NUMBER).all():
+                return values, frame_time
+    # numpy's reader is fast, but wants a frame a line and no note after them, and its messages know no BVH.
+    values, broken, frame = [], None, 0
+    for line, row in enumerate(rows.split(b"\n"), start=line_at(head.end())):
+        words = row.decode("utf-8", "replace").split()
+        numbers = [finite_number(word) for word in words]
+        if not words or (len(values) >= np.prod(shape) and numbers[0] is None):
+            continue
+        values += numbers
+        if broken is None and None in numbers[: len(labels) + 1]:
+            column = numbers.index(None)
+            place = f"number {column + 1} of frame {frame}, {labels.get(column, 'beyond the last channel')}"
+            how = f"is not a finite number of at most {LARGEST_NUMBER:g}{_comma(words[column])}"
+            broken = line, f"{words[column][:40]!r} ({place}) {how}; mend it or export again"
+        elif broken is None and len(words) != len(labels):
+            how = "cut off" if len(words) < len(labels) else "too long"
+            what = f"frame {frame} has {len(words)} numbers where the HIERARCHY has {len(labels)} channels"
+            broken = line, f"{what}: the row is {how}; export the file again"
+        frame += 1
+    if len(values) == np.prod(shape) and None not in values:
+        return np.reshape(np.array(values, np.float64), shape), frame_time
+    what = f"Frames: says {count}, but {frame} rows of numbers follow"
+    raise _Broken(*(broken or (line_at(head.start(1)), f"{what}; export the file again or mend the count")))
 
 
-def _build_motion(joints, end_sites, values, frame_time, name, scale) -> Motion:
+def _build_motion(joints, end_sites, values, frame_time, name) -> Motion:
     """Turn channel values into root positions, bones and matrices."""
     frames, count = len(values), len(joints)
     turns = [joint.columns("rotation") for joint in joints]
@@ -307,31 +293,25 @@ def _build_motion(joints, end_sites, values, frame_time, name, scale) -> Motion:
         members = [joint for joint, columns in enumerate(turns) if "".join(columns) == order]
         rotations[:, members] = matrix_from_euler(order, values[:, [list(turns[joint].values()) for joint in members]])
 
-    moves = [joint.columns("position") for joint in joints]
-
-    def channel_positions(joint):
-        position = np.tile(scale * np.array(joints[joint].offset), (frames, 1))
-        for axis, column in moves[joint].items():
-            position[:, "XYZ".index(axis)] = scale * values[:, column]
-        return position
-
+    offsets = np.array([joint.offset for joint in joints])
+    moves, places = [joint.columns("position") for joint in joints], np.tile(offsets, (frames, 1, 1))
+    for joint, columns in enumerate(moves):
+        for axis, column in columns.items():
+            places[:, joint, "XYZ".index(axis)] = _METRES * values[:, column]
     parents = [joint.parent for joint in joints]
-    root, root_position = 0, channel_positions(0)
+    root, root_position = 0, places[:, 0]
     if count > 1 and moves[0] and moves[1] and parents.count(0) == 1:
         # The first joint only carries the second, which becomes the root.
         root = 1
-        root_position = root_position + np.einsum("tab,tb->ta", rotations[:, 0], channel_positions(1))
+        root_position = root_position + np.einsum("tab,tb->ta", rotations[:, 0], places[:, 1])
         rotations[:, 1] = rotations[:, 0] @ rotations[:, 1]
 
-    offsets, wandered = np.zeros((count, 3)), 0.0
+    offsets[root], wandered = 0.0, 0.0
     for joint in range(root + 1, count):
-        if not moves[joint]:
-            offsets[joint] = scale * np.array(joints[joint].offset)
+        if not values[:, list(moves[joint].values())].any():  # nothing is said beside OFFSET
             continue
-        position = channel_positions(joint)
-        zero = not values[:, list(moves[joint].values())].any()  # nothing is said beside OFFSET
-        offsets[joint] = scale * np.array(joints[joint].offset) if zero else position.mean(axis=0)
-        error = 0.0 * position[:, 0] if zero else np.abs(position - offsets[joint]).max(axis=1)
+        offsets[joint] = places[:, joint].mean(axis=0)
+        error = np.abs(places[:, joint] - offsets[joint]).max(axis=1)
         wandered = max(wandered, error.max())
         if error.max() > RIGID_TOLERANCE:
             what = f"position channels of {joints[joint].name!r} move by {1000 * error.max():.1f} mm"
@@ -339,7 +319,7 @@ def _build_motion(joints, end_sites, values, frame_time, name, scale) -> Motion:
             raise _Broken(joints[joint].line, f"{what} {where}")
     if wandered > TOLD_TOLERANCE:
         log.warning("%s: bones change by up to %.1f mm; each is as long as on average", name, 1000 * wandered)
-    tips = [(joint - root, [scale * value for value in offset]) for joint, offset in end_sites if joint >= root]
+    tips = [(joint - root, offset) for joint, offset in end_sites if joint >= root]
     names, parents = [joint.name for joint in joints[root:]], [max(parent - root, -1) for parent in parents[root:]]
     skeleton = Skeleton(names, parents, offsets[root:], tips)
     return Motion(skeleton, root_position, rotations[:, root:], fps=1.0 / frame_time, name=name)
