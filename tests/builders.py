@@ -120,6 +120,11 @@ def packed_from(clips, *, styles=("calm", "proud"), mirror_styles=()) -> PackedM
     )
 
 
+def walk_with_contacts(style, seconds, seed=0, fps=30.0):
+    """A walk of the synthetic walker, and the contacts that it planned, [T, 2]."""
+    return synthetic._walk(style, seed, fps, round(seconds * fps))
+
+
 def walks_of(styles, splits=(0, 0, 1, 2, 2), seconds: float = 4.0) -> PackedMotion:
     """Packed walks of these styles of the synthetic walker, one of each for each split number."""
     made = [

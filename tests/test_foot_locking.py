@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from builders import SKELETON as SHORT_LEGS
-from builders import refused, straight_motion
+from builders import refused, straight_motion, walk_with_contacts
 from scipy.spatial.transform import Rotation
 
 from f3amd_companion.serving import foot_locking
@@ -25,7 +25,7 @@ from f3amd_lib.measures.metrics import joint_acceleration
 from f3amd_lib.measures.walking import floor_penetration, slide_speed, stepping_rate, toe_positions
 from f3amd_lib.motion.root_paths import named_path
 from f3amd_lib.motion.skeleton import Motion, Skeleton, global_rotations
-from f3amd_lib.motion.synthetic import SYNTHETIC_SKELETON, synthesize, synthesize_with_contacts
+from f3amd_lib.motion.synthetic import SYNTHETIC_SKELETON, synthesize
 from f3amd_lib.rollout.rollout import Rollout
 
 FLOOR = 0.012
@@ -79,7 +79,7 @@ def toe_steps(motion: Motion) -> np.ndarray:
 
 @pytest.mark.parametrize("style", ["Neutral", "Crab", "Runner", "Tiptoe"])
 def test_plan_finds_the_walkers_own_contacts(style):
-    motion, true = synthesize_with_contacts(style, 12)
+    motion, true = walk_with_contacts(style, 12)
     plan = plan_contacts(motion.positions, motion.skeleton)
     assert (plan == true).mean() > 0.88 and not (true & ~plan).any()
     high = toe_positions(motion.positions, motion.skeleton)[..., 1] > 0.06

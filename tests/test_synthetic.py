@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from builders import walk_with_contacts
 
 from f3amd_lib.motion import synthetic
 from f3amd_lib.motion.rotations import matrix_from_yaw, wrap_angle
-from f3amd_lib.motion.synthetic import STYLES, SYNTHETIC_SKELETON, synthesize, synthesize_with_contacts
+from f3amd_lib.motion.synthetic import STYLES, SYNTHETIC_SKELETON, synthesize
 
 SAMPLE = "Neutral Shuffling Runner HighKnees TwoFootJump Crab LimpLeft Drunk Tightrope DeepKnees".split()
 
@@ -13,7 +14,7 @@ SAMPLE = "Neutral Shuffling Runner HighKnees TwoFootJump Crab LimpLeft Drunk Tig
 @pytest.fixture(scope="module")
 def all_styles():
     """Twenty seconds of every style: {name: (motion, contacts)}."""
-    return {style: synthesize_with_contacts(style, 20.0, seed=1) for style in STYLES}
+    return {style: walk_with_contacts(style, 20.0, seed=1) for style in STYLES}
 
 
 def toe_steps(motion) -> np.ndarray:
@@ -85,7 +86,7 @@ def test_random_numbers_are_pinned_for_all_machines():
 
 @pytest.mark.parametrize(("seconds", "fps", "frames"), [(2.0, 30.0, 60), (1.51, 60.0, 91)])
 def test_length_and_rate(seconds, fps, frames):
-    motion, contacts = synthesize_with_contacts("March", seconds, fps=fps)
+    motion, contacts = walk_with_contacts("March", seconds, fps=fps)
     assert (motion.num_frames, motion.fps) == (frames, fps)
     assert contacts.shape == (frames, 2)
     assert contacts.dtype == bool
@@ -105,7 +106,7 @@ def test_the_frame_rate_does_not_change_the_motion():
 @pytest.mark.parametrize("style", SAMPLE)
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_planted_toes_do_not_slide(style, seed):
-    motion, contacts = synthesize_with_contacts(style, 30.0, seed=seed)
+    motion, contacts = walk_with_contacts(style, 30.0, seed=seed)
     steps = toe_steps(motion)
     planned = contacts[:-1]
     assert 0.15 < planned.mean() < 0.9
@@ -163,7 +164,7 @@ def test_accelerations_are_human(all_styles):
 
 
 def test_paths_turn_stop_and_change_speed():
-    motion, contacts = synthesize_with_contacts("Neutral", 120.0, seed=0)
+    motion, contacts = walk_with_contacts("Neutral", 120.0, seed=0)
     speed = ground_speed(motion)
     assert np.quantile(speed, 0.02) < 0.1
     assert np.quantile(speed, 0.95) > 1.2

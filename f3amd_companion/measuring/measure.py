@@ -301,7 +301,7 @@ def _measure_walks(
         elif made and name == "walking":  # its source walks any path
             for seed, lines in paths.items():
                 for style, line in zip(styles, lines, strict=True):
-                    yield "as made", seed, style, walk_along(style, line.position, line.yaw)
+                    yield "as made", seed, style, walk_along(style, line)
         else:
             yield from (("as made", 0, style, motion) for style, motion in _real_walks(packed, profile, styles))
 

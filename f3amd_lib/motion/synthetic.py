@@ -16,6 +16,7 @@ frames. Units are metres, seconds and (where a name ends in `_deg`) degrees; +Y 
 """
 
 import hashlib
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import NamedTuple
@@ -25,11 +26,12 @@ from scipy.interpolate import CubicSpline, PchipInterpolator
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from f3amd_lib.ground.arrays import check_positive, finite_array
+from f3amd_lib.ground.arrays import check_positive
 from f3amd_lib.ground.files import read_toml
 from f3amd_lib.ground.names import check_known
 from f3amd_lib.motion.curves import smooth_above, smoothstep, unit
-from f3amd_lib.motion.rotations import matrix_from_yaw
+from f3amd_lib.motion.root_paths import RootPath
+from f3amd_lib.motion.rotations import matrix_from_euler, wrap_angle
 from f3amd_lib.motion.skeleton import Motion, Skeleton
 
 # ------------------------------------------------------------------------------------ skeleton
@@ -114,15 +116,14 @@ def _wander(rng: np.random.Generator, count: int, sigma: float, channels: int) -
     return gaussian_filter1d(noise, width, axis=0, mode="reflect") * np.sqrt(2.0 * np.sqrt(np.pi) * width)
 
 
-def _about(axis: int, degrees) -> np.ndarray:
-    """Return rotations about one coordinate axis, [..., 3, 3]; degrees in."""
-    about_y = matrix_from_yaw(np.radians(np.asarray(degrees, dtype=np.float64)))
-    return np.roll(about_y, (axis - 1, axis - 1), axis=(-2, -1))
+def _turned(axes: str, *degrees) -> np.ndarray:
+    """Return rotations about axes, one after the other, [..., 3, 3]: yaw and pitch are a turn left and a bow."""
+    return matrix_from_euler(axes, np.stack(np.broadcast_arrays(*degrees), axis=-1))
 
 
-def _yaw_pitch_roll(yaw_deg, pitch_deg, left_roll_deg) -> np.ndarray:
-    """Turn left, then bow forwards, then lean to the left (all in degrees), [..., 3, 3]."""
-    return _about(1, yaw_deg) @ _about(0, pitch_deg) @ _about(2, -np.asarray(left_roll_deg))
+def _ahead(yaw) -> np.ndarray:
+    """Return the direction (x, z) that a yaw faces, [..., 2]; its left is a quarter turn further."""
+    return np.stack([np.sin(yaw), np.cos(yaw)], axis=-1)
 
 
 # ------------------------------------------------------------------------------- 1. root path
@@ -148,10 +149,15 @@ _STRETCHES = read_toml(Path(__file__).with_name("stretches.toml"))
 """What a path is strung together from; the file says what its numbers mean."""
 
 
+def _planned_times(seconds: float) -> np.ndarray:
+    """Return the planning grid of a clip, from `_LEAD` before it to `_LEAD` after it, seconds."""
+    return np.arange(int(np.ceil((seconds + 2 * _LEAD) * _GRID_RATE)) + 1) / _GRID_RATE - _LEAD
+
+
 def _plan_path(style, seconds: float, rng: np.random.Generator) -> _Path:
     """String random stretches together and smooth speed, turning and heading."""
-    count = int(np.ceil((seconds + 2 * _LEAD) * _GRID_RATE)) + 1
-    time = np.arange(count) / _GRID_RATE - _LEAD
+    time = _planned_times(seconds)
+    count = len(time)
     kinds, weights = zip(*((name, of["weight"]) for name, of in _STRETCHES.items() if "weight" in of), strict=True)
     speed, turn, heading = np.zeros(count), np.zeros(count), np.zeros(count)
     start, forced, stood = 0, "straight", False
@@ -198,19 +204,17 @@ def _plan_path(style, seconds: float, rng: np.random.Generator) -> _Path:
     turn = turn + 0.25 * wobble * np.clip(speed, 0.0, 1.0)
     yaw = rng.uniform(-np.pi, np.pi) + np.cumsum(turn) / _GRID_RATE
     going = yaw + np.radians(heading + style.heading_deg)
-    velocity = speed[:, None] * np.stack([np.sin(going), np.cos(going)], axis=-1)
-    position = np.cumsum(velocity, axis=0) / _GRID_RATE
+    position = np.cumsum(speed[:, None] * _ahead(going), axis=0) / _GRID_RATE
     position -= position[int(_LEAD * _GRID_RATE)]
     return _Path(time, position, yaw, speed, turn, heading)
 
 
-def _given_path(position: np.ndarray, yaw: np.ndarray, fps: float) -> _Path:
+def _given_path(path: RootPath) -> _Path:
     """Lay a path that somebody drew on the planning grid; it goes straight on at both ends."""
-    frames = len(yaw)
-    count = int(np.ceil((frames / fps + 2 * _LEAD) * _GRID_RATE)) + 1
-    time = np.arange(count) / _GRID_RATE - _LEAD
+    frames, fps = path.num_frames, path.fps
+    time = _planned_times(frames / fps)
     drawn = np.arange(frames) / fps
-    columns = np.concatenate([position, np.unwrap(yaw)[:, None]], axis=1)
+    columns = np.concatenate([path.position, path.yaw[:, None]], axis=1)
     inside = CubicSpline(drawn, columns)(np.clip(time, 0.0, drawn[-1]))
     # Before the first and after the last frame: as fast as there, and no further turn.
     early = np.minimum(time, 0.0)[:, None] * (columns[1] - columns[0]) * fps
@@ -218,12 +222,9 @@ def _given_path(position: np.ndarray, yaw: np.ndarray, fps: float) -> _Path:
     inside[:, :2] += (early + late)[:, :2]
     velocity = _smooth(np.gradient(inside, 1.0 / _GRID_RATE, axis=0), 0.08, _GRID_RATE)
     speed = np.linalg.norm(velocity[:, :2], axis=-1)
-    angle = inside[:, 2]
-    ahead = velocity[:, 0] * np.sin(angle) + velocity[:, 1] * np.cos(angle)
-    left = velocity[:, 0] * np.cos(angle) - velocity[:, 1] * np.sin(angle)
-    heading = np.where(speed > 0.05, np.arctan2(left, ahead), 0.0)
-    heading = np.degrees(_smooth(np.unwrap(heading), 0.15, _GRID_RATE))
-    return _Path(time, inside[:, :2], angle, speed, velocity[:, 2], heading)
+    heading = wrap_angle(np.arctan2(velocity[:, 0], velocity[:, 1]) - inside[:, 2])
+    heading = np.degrees(_smooth(np.unwrap(np.where(speed > 0.05, heading, 0.0)), 0.15, _GRID_RATE))
+    return _Path(time, inside[:, :2], inside[:, 2], speed, velocity[:, 2], heading)
 
 
 # ------------------------------------------------------------------------------- 2. footfalls
@@ -233,14 +234,10 @@ def _home(style, path: _Path, time: float, side: float, width: float):
     """Return where a toe wants to stand (x, z) and its yaw, for the body's place at a time."""
     index = path.at(time)
     yaw = path.yaw[index]
-    left = np.array([np.cos(yaw), -np.sin(yaw)])
-    ahead = np.array([np.sin(yaw), np.cos(yaw)])
-    foot_yaw = yaw + side * np.radians(style.toe_out_deg)
-    toe = _TOE_OFFSET[2] * np.array([np.sin(foot_yaw), np.cos(foot_yaw)])
+    left, foot_yaw = _ahead(yaw + np.pi / 2), yaw + side * np.radians(style.toe_out_deg)
     # Bowing forwards moves the pelvis back over the feet.
-    lean = np.radians(style.pelvis_pitch_deg + 0.6 * style.spine_pitch_deg)
-    balance = 0.10 * np.sin(lean)
-    place = path.position[index] + side * 0.5 * width * left + balance * ahead + toe
+    balance = 0.10 * np.sin(np.radians(style.pelvis_pitch_deg + 0.6 * style.spine_pitch_deg))
+    place = path.position[index] + side * 0.5 * width * left + balance * _ahead(yaw) + _TOE_OFFSET[2] * _ahead(foot_yaw)
     return place, foot_yaw, left
 
 
@@ -260,8 +257,7 @@ def _plan_footfalls(style, path: _Path, rng: np.random.Generator):
     stretch = max(0.36, 1.12 * style.duty * style.step_length)
     begin, end = path.time[0], path.time[-1]
     homes = [_home(style, path, begin, side, style.step_width) for side in sides]
-    land, lift = ([begin - 1.0], [begin - 1.0]), ([], [])
-    place, yaw = ([[home[which]] for home in homes] for which in (0, 1))
+    stands = [[SimpleNamespace(land=begin - 1.0, lift=end + 10.0, place=place, yaw=yaw)] for place, yaw, _ in homes]
     knots, strides = [begin], [share]
     now, foot, standing = begin, int(rng.integers(2)), True
     while now < end:
@@ -286,28 +282,28 @@ def _plan_footfalls(style, path: _Path, rng: np.random.Generator):
                 landed = now + stride * (rhythm if foot == 1 else 1.0 - rhythm)
                 begun = landed - swing
             # A foot that the body outruns leaves early, but not before the other one stands.
-            earliest = max(now if standing else min(begun, now + 0.02), land[foot][-1] + 0.10)
+            last = stands[foot][-1]
+            earliest = max(now if standing else min(begun, now + 0.02), last.land + 0.10)
             while begun > earliest:
                 rest, _, _ = _home(style, path, begun, sides[foot], width)
-                if np.linalg.norm(rest - place[foot][-1]) < stretch:
+                if np.linalg.norm(rest - last.place) < stretch:
                     break
                 begun, landed = begun - 0.02, landed - 0.02
-            begun = max(begun, land[foot][-1] + 0.10)
+            begun = max(begun, last.land + 0.10)
             landed = max(landed, begun + 0.20)
             width += 0.5 * sideways * path.speed[middle] * beat
             target = landed + style.duty * beat
         else:
             # Standing: bring a foot that was left behind back under the body.
             errors = []
-            for other in (0, 1):
-                position, angle, _ = _home(style, path, now + 0.5, sides[other], width)
-                off = np.linalg.norm(position - place[other][-1])
-                errors.append(off + 0.12 * abs(angle - yaw[other][-1]))
+            for side, (*_, last) in zip(sides, stands, strict=True):
+                position, angle, _ = _home(style, path, now + 0.5, side, width)
+                errors.append(np.linalg.norm(position - last.place) + 0.12 * abs(angle - last.yaw))
             foot = int(np.argmax(errors))
             if errors[foot] < 0.06:
                 now, standing = now + 0.05, True
                 continue
-            begun = max(now + 0.03, land[foot][-1] + 0.12)
+            begun = max(now + 0.03, stands[foot][-1].land + 0.12)
             landed = begun + 0.42
             target = landed + 0.3
         scatter = 0.004 + 0.025 * style.unsteadiness
@@ -320,21 +316,18 @@ def _plan_footfalls(style, path: _Path, rng: np.random.Generator):
         position = position + scatter * np.clip(rng.standard_normal(2), -2.0, 2.0)
         angle = angle + 0.5 * scatter * rng.standard_normal()
         # Feet keep clear of each other, unless the style walks on a line.
-        apart = sides[foot] * float((position - place[1 - foot][-1]) @ left)
+        apart = sides[foot] * float((position - stands[1 - foot][-1].place) @ left)
         clear = min(0.085, style.step_width)
         if apart < clear:
             position = position + sides[foot] * (clear - apart) * left
-        lift[foot].append(begun)
-        land[foot].append(landed)
-        place[foot].append(position)
-        yaw[foot].append(angle)
+        stands[foot][-1].lift = begun
+        stands[foot].append(SimpleNamespace(land=landed, lift=end + 10.0, place=position, yaw=angle))
         step = strides[-1] + 1e-3
         strides.append(np.ceil(step) if foot == 0 else np.ceil(step - share) + share)
         knots.append(landed)
         now, foot, standing = landed, 1 - foot, False
-    for lifts in lift:
-        lifts.append(end + 10.0)
-    plants = [tuple(map(np.array, columns)) for columns in zip(land, lift, place, yaw, strict=True)]
+    column = lambda foot, name: np.array([getattr(stand, name) for stand in foot])
+    plants = [tuple(column(foot, name) for name in ("land", "lift", "place", "yaw")) for foot in stands]
     return plants, np.array(knots), np.array(strides)
 
 
@@ -364,13 +357,12 @@ def _move_foot(style, plants, time: np.ndarray, side: float, fps: float):
     reach = np.linalg.norm(np.diff(place, axis=0), axis=-1)
     reach = np.append(reach, 0.0) / (2.0 * style.step_length)
     effort = np.clip(0.30 + 0.70 * reach, 0.30, 1.15)
-    facing = np.stack([np.sin(plant_yaw), np.cos(plant_yaw)], axis=-1)
-    forward = np.append(np.sum(np.diff(place, axis=0) * facing[:-1], -1), 0.0)
+    forward = np.append(np.sum(np.diff(place, axis=0) * _ahead(plant_yaw)[:-1], -1), 0.0)
     forward = np.clip(forward / (2.0 * style.step_length), -1.0, 1.15)
     scale = style.left_lift_scale if side > 0 else style.right_lift_scale
     arc = progress**2 * (1.0 - progress) ** 2.5 * 26.0
     height = style.foot_lift * scale * effort[index] * arc
-    outwards = side * np.stack([np.cos(yaw), -np.sin(yaw)], axis=-1)
+    outwards = _ahead(yaw + side * np.pi / 2)
     flat = flat + (style.circumduction * 16.0 * (progress * (1.0 - progress)) ** 2)[:, None] * outwards
 
     keys, values = [], []
@@ -392,8 +384,8 @@ def _move_foot(style, plants, time: np.ndarray, side: float, fps: float):
     toe = np.stack([flat[:, 0], _TOE_HEIGHT + height, flat[:, 1]], axis=-1)
     # On the ground toes stay flat while the heel rises; in the air they follow the foot.
     flex = np.where(planted, 1.0, 1.0 - 0.85 * smoothstep(progress / 0.3) * smoothstep((1 - progress) / 0.2))
-    frame = matrix_from_yaw(yaw) @ _about(0, pitch)
-    return toe - frame @ _TOE_OFFSET, yaw, frame, _about(0, -np.maximum(pitch, 0.0) * flex), planted
+    frame = _turned("YX", np.degrees(yaw), pitch)
+    return toe - frame @ _TOE_OFFSET, yaw, frame, _turned("X", -np.maximum(pitch, 0.0) * flex), planted
 
 
 # ---------------------------------------------------------------------------- 4 and 5. the legs
@@ -443,42 +435,31 @@ def _arm(pose, side, swing, gesture, lean_deg, roll_deg, drift):
     twist = pose.twist_deg + pose.wave_twist_deg * np.sin(gesture)
     elbow = pose.elbow_deg + pose.elbow_swing_deg * np.maximum(swing + 0.3, 0.0) ** 2
     elbow = np.maximum(elbow + pose.wave_elbow_deg * np.sin(gesture) + 1.5 * drift[:, 2], 2.0)
-    shoulder = _about(0, -forward) @ _about(2, side * (out - 90.0)) @ _about(0, twist)
-    wrist = _about(2, -side * (4.0 + 2.0 * drift[:, 1])) @ _about(1, -side * (6.0 + 3.0 * swing))
-    return shoulder, _about(1, -side * elbow), wrist
+    shoulder = _turned("XZX", -forward, side * (out - 90.0), twist)
+    wrist = _turned("ZY", -side * (4.0 + 2.0 * drift[:, 1]), -side * (6.0 + 3.0 * swing))
+    return shoulder, _turned("Y", -side * elbow), wrist
 
 
 # ------------------------------------------------------------------------------------ assembly
 
 
-def walk_along(style: str, position, yaw) -> Motion:
+def walk_along(style: str, path: RootPath) -> Motion:
     """Let the walker follow a path that somebody drew: what a generated walk is held against.
 
     Args:
       style: one of `STYLES`.
-      position: [T, 2], x and z in metres, T >= 4.
-      yaw: facing, [T], radians; the direction of travel is the path's own.
-
-    Returns:
-      The motion at 30 fps, as the path.
+      path: T >= 4 frames, the motion's frame rate; the direction of travel is the path's own.
 
     Raises:
-      ValueError: for an unknown style, shapes that do not fit, or a number that is not finite.
+      ValueError: for an unknown style, or a path that is too short.
     """
-    position = finite_array("path position", position, ("frame", 2))
-    yaw = finite_array("path yaw", yaw, (len(position),))
-    if len(yaw) < 4:
-        raise ValueError(f"a path needs 4 frames or more, got {len(yaw)}")
-    return _walk(style_parameters(style), style, 0, 30.0, len(yaw), (position, yaw))[0]
+    if path.num_frames < 4:
+        raise ValueError(f"a path needs 4 frames or more, got {path.num_frames}")
+    return _walk(style, 0, path.fps, path.num_frames, path)[0]
 
 
 def synthesize(style: str, seconds: float = 60.0, seed: int = 0, fps: float = 30.0) -> Motion:
-    """Return a clip of styled locomotion: the motion of `synthesize_with_contacts`."""
-    return synthesize_with_contacts(style, seconds, seed, fps)[0]
-
-
-def synthesize_with_contacts(style: str, seconds=60.0, seed: int = 0, fps: float = 30.0) -> tuple[Motion, np.ndarray]:
-    """Make a clip of styled locomotion together with its planned contacts.
+    """Make a clip of styled locomotion.
 
     Args:
       style: one of `STYLES`.
@@ -487,8 +468,7 @@ def synthesize_with_contacts(style: str, seconds=60.0, seed: int = 0, fps: float
       fps: frames per second.
 
     Returns:
-      The motion (T = round(seconds * fps) frames of 23 joints, metres, floor at y = 0) and the planned toe contacts
-      [T, 2] of bool, left then right: the toe stands still from this frame to the next.
+      The motion: T = round(seconds * fps) frames of 23 joints, metres, floor at y = 0.
 
     Raises:
       ValueError: for an unknown style, or a length or rate that gives no frame.
@@ -496,13 +476,18 @@ def synthesize_with_contacts(style: str, seconds=60.0, seed: int = 0, fps: float
     check_positive("fps", fps)
     if not np.isfinite(seconds) or round(seconds * fps) < 1:
         raise ValueError(f"seconds must give at least one frame at {fps} fps, got {seconds}")
-    return _walk(style_parameters(style), style, seed, fps, int(round(seconds * fps)))
+    return _walk(style, seed, fps, int(round(seconds * fps)))[0]
 
 
-def _walk(parameters, style: str, seed: int, fps: float, frames: int, drawn=None) -> tuple[Motion, np.ndarray]:
-    """Make motion and contacts along a random path, or along a drawn one (position, yaw)."""
-    rng = _generator(style, seed)
-    path = _given_path(*drawn, fps) if drawn else _plan_path(parameters, frames / fps, rng)
+def _walk(style: str, seed: int, fps: float, frames: int, drawn: RootPath | None = None) -> tuple[Motion, np.ndarray]:
+    """Walk along a random path, or along a drawn one.
+
+    Returns:
+      Motion, and the planned toe contacts [T, 2] of bool, left then right: the toe stands still from this frame to the
+      next.
+    """
+    parameters, rng = style_parameters(style), _generator(style, seed)
+    path = _given_path(drawn) if drawn else _plan_path(parameters, frames / fps, rng)
     plants, knots, strides = _plan_footfalls(parameters, path, rng)
     drift = _wander(rng, len(path.time), 0.7, 12)
     gesture_start = rng.uniform(0.0, 2.0 * np.pi)
@@ -529,14 +514,12 @@ def _walk(parameters, style: str, seed: int, fps: float, frames: int, drawn=None
     pelvis_yaw = np.degrees(yaw) - effort * parameters.hip_twist_deg * np.cos(cycle)
     pelvis_roll = effort * parameters.hip_roll_deg * np.sin(cycle) * -1.0 + 0.5 * bank + 0.6 * drift[:, 0] * 0.5
     pelvis_pitch = parameters.pelvis_pitch_deg + 1.5 * np.clip(accelerate, -2, 2) + 0.3 * drift[:, 1]
-    pelvis = _yaw_pitch_roll(pelvis_yaw, pelvis_pitch, pelvis_roll)
-    left = np.stack([np.cos(yaw), -np.sin(yaw)], axis=-1)
-    ahead = np.stack([np.sin(yaw), np.cos(yaw)], axis=-1)
+    pelvis = _turned("YXZ", pelvis_yaw, pelvis_pitch, -pelvis_roll)
     # Weight is carried from foot to foot across the path, so hardly at all in a side step.
     across = np.abs(np.cos(np.radians(heading + parameters.heading_deg)))
     sway = effort * across * parameters.sway * np.sin(cycle) + 0.006 * drift[:, 2]
     surge = 0.012 * effort * np.sin(2.0 * cycle) + 0.005 * drift[:, 3]
-    root_flat = root_flat + sway[:, None] * left + surge[:, None] * ahead
+    root_flat = root_flat + sway[:, None] * _ahead(yaw + np.pi / 2) + surge[:, None] * _ahead(yaw)
 
     leg = _THIGH + _SHANK
     stand = _TOE_HEIGHT - _TOE_OFFSET[1] + 0.988 * leg - _HIP_OFFSET[1]
@@ -549,19 +532,15 @@ def _walk(parameters, style: str, seed: int, fps: float, frames: int, drawn=None
     height = _lower_pelvis(height, root_flat, pelvis, ankles, 0.990 * leg, fps)
     root = np.stack([root_flat[:, 0], height, root_flat[:, 1]], axis=-1)
 
-    count = len(time)
-    local = np.broadcast_to(np.eye(3), (count, SYNTHETIC_SKELETON.num_joints, 3, 3)).copy()
+    local = np.tile(np.eye(3), (len(time), SYNTHETIC_SKELETON.num_joints, 1, 1))
     joint = SYNTHETIC_SKELETON.index
     local[:, 0] = pelvis
-    transpose = np.swapaxes(pelvis, -1, -2)
     for name, side, (ankle, foot_yaw, foot, toe, _) in zip(("Left", "Right"), (1.0, -1.0), feet, strict=True):
         hip = root + pelvis @ (_HIP_OFFSET * [side, 1.0, 1.0])
         bearing = 0.5 * (foot_yaw + np.radians(pelvis_yaw)) + side * np.radians(parameters.knee_out_deg)
-        pole = np.stack([np.sin(bearing), np.zeros(count), np.cos(bearing)], axis=-1)
-        thigh, shank = _bend_leg(hip, ankle, pole)
-        local[:, joint(f"{name}Hip")] = transpose @ thigh
-        local[:, joint(f"{name}Knee")] = np.swapaxes(thigh, -1, -2) @ shank
-        local[:, joint(f"{name}Ankle")] = np.swapaxes(shank, -1, -2) @ foot
+        thigh, shank = _bend_leg(hip, ankle, np.insert(_ahead(bearing), 1, 0.0, axis=-1))
+        for part, (above, below) in zip(("Hip", "Knee", "Ankle"), pairwise((pelvis, thigh, shank, foot)), strict=True):
+            local[:, joint(f"{name}{part}")] = np.swapaxes(above, -1, -2) @ below
         local[:, joint(f"{name}Toe")] = toe
 
     # Spine: posture, shoulders against hips, and a trunk that stays upright over a rolling pelvis.
@@ -572,7 +551,7 @@ def _walk(parameters, style: str, seed: int, fps: float, frames: int, drawn=None
     spine_roll = parameters.spine_roll_deg - 0.8 * pelvis_roll + 0.9 * bank + 0.8 * drift[:, 6]
     spine_roll = spine_roll + effort * parameters.chest_roll_deg * np.sin(cycle)
     spine_roll = spine_roll + 9.0 * spared * np.sign(parameters.limp)
-    each = _yaw_pitch_roll(spine_yaw / 4.0, spine_pitch / 4.0, spine_roll / 4.0)
+    each = _turned("YXZ", spine_yaw / 4.0, spine_pitch / 4.0, -spine_roll / 4.0)
     chest = pelvis
     for name in _SPINE:
         local[:, joint(name)] = each
@@ -584,8 +563,8 @@ def _walk(parameters, style: str, seed: int, fps: float, frames: int, drawn=None
     nod = parameters.head_pitch_deg + 0.35 * (parameters.pelvis_pitch_deg + parameters.spine_pitch_deg)
     nod = nod + effort * parameters.head_bob_deg * np.cos(2.0 * cycle) + 1.2 * drift[:, 8]
     tilt = parameters.head_roll_deg + 0.4 * parameters.spine_roll_deg + 0.4 * bank
-    head = np.swapaxes(chest, -1, -2) @ _yaw_pitch_roll(look, nod, tilt)
-    half = Rotation.from_rotvec(0.5 * Rotation.from_matrix(head).as_rotvec()).as_matrix()
+    head = np.swapaxes(chest, -1, -2) @ _turned("YXZ", look, nod, -tilt)
+    half = (Rotation.from_matrix(head) ** 0.5).as_matrix()
     local[:, joint("Neck")] = local[:, joint("Head")] = half
 
     # Arms swing against the legs; the trunk's lean is given back to gravity.
@@ -600,7 +579,7 @@ def _walk(parameters, style: str, seed: int, fps: float, frames: int, drawn=None
         for part, rotation in zip(("Shoulder", "Elbow", "Wrist"), parts, strict=True):
             local[:, joint(f"{name}{part}")] = rotation
         lift = parameters.shrug_deg + 0.12 * max(pose.side_deg - 60.0, 0.0)
-        local[:, joint(f"{name}Collar")] = _about(2, side * lift)
+        local[:, joint(f"{name}Collar")] = _turned("Z", side * lift)
 
     keep = slice(margin, margin + frames)
     planted = np.stack(planted, axis=-1)
