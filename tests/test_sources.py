@@ -296,12 +296,13 @@ def test_100style_own_tables(data_dir):
     folder = data_dir if data_dir.is_dir() else data_dir.parent
     if not (folder / "100style_Frame_Cuts.csv").is_file():
         pytest.skip("no 100style_Frame_Cuts.csv in the data folder")
-    archive = sources._Archive(str(folder))
-    cuts = sources._read_frame_cuts(archive, "100style_Frame_Cuts.csv")
+    names = ("Frame_Cuts.csv", "Dataset_List.csv")
+    files = {name: sources._File(name, (folder / f"100style_{name}").read_bytes) for name in names}
+    cuts = sources._read_frame_cuts(folder, files)
     assert len(cuts) == 810 and len({style for style, _ in cuts}) == 100
     assert sum(stop - start for start, stop in cuts.values()) == 4_055_978
     assert cuts["Aeroplane", "BR"] == (318, 5593)
-    symmetric = sources._read_symmetric(archive, "100style_Dataset_List.csv")
+    symmetric = sources._read_symmetric(folder, files)
     assert len(symmetric) == 70 and "Zombie" in symmetric and "LimpLeft" not in symmetric
 
 

@@ -28,6 +28,7 @@ import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -239,9 +240,36 @@ _MOST_FILES, _MOST_BYTES, _MOST_IN_ALL, _MOST_RATIO = 100_000, 1 << 29, 1 << 35,
 in all, of 17 MB at most; text of numbers shrinks 3 to 5 times, of still frames up to 100 times.)"""
 
 
-@functools.lru_cache(maxsize=4)
-def _open_zip(path: str, size: int, modified_ns: int) -> zipfile.ZipFile:
-    """Open a zip once per process; a changed file is opened anew."""
+class _File(NamedTuple):
+    """A file of a folder or of a zip, read alike.
+
+    Attributes:
+      label: where it lies, for messages.
+      reader: returns its bytes.
+      listed: what a zip's directory says of it.
+    """
+
+    label: str
+    reader: Callable[[], bytes]
+    listed: zipfile.ZipInfo | None = None
+
+    def read(self) -> bytes:
+        """Return the bytes; ValueError names the file if they cannot be had."""
+        try:
+            return self.reader()
+        except Exception as error:  # whatever a damaged member of a zip, or a file that went away, raises
+            raise ValueError(f"{self.label}: damaged, nothing of it is used ({error}); fetch it again") from error
+
+    def size_and_crc(self) -> tuple[int, int]:
+        """Return size and CRC-32: from a zip's directory, or by reading a plain file."""
+        if self.listed:
+            return self.listed.file_size, self.listed.CRC
+        data = self.read()
+        return len(data), zlib.crc32(data)
+
+
+def _open_zip(path: Path) -> zipfile.ZipFile:
+    """Open a zip, which stays open for as long as one of its files may be read."""
     try:
         try:  # names without a mark of their encoding are mostly UTF-8, else as the format has it (cp437)
             opened = zipfile.ZipFile(path, metadata_encoding="utf-8")
@@ -259,57 +287,21 @@ def _open_zip(path: str, size: int, modified_ns: int) -> zipfile.ZipFile:
     return opened
 
 
-@dataclass(frozen=True)
-class _Archive:
-    """A folder or a zip file, read alike. Holds only its path: a zip stays open for all who read from it."""
-
-    path: str
-
-    @property
-    def is_zip(self) -> bool:
-        return os.path.isfile(self.path)
-
-    def _zip(self) -> zipfile.ZipFile:
-        state = os.stat(self.path)
-        return _open_zip(self.path, state.st_size, state.st_mtime_ns)
-
-    def names(self) -> list[str]:
-        """Return the relative paths of all files, sorted, without macOS's `._` forks and `__MACOSX` folders."""
-        if self.is_zip:
-            names = [info.filename for info in self._zip().infolist() if not info.filename.endswith("/")]
-        else:
-            top = Path(self.path)
-            names = [item.relative_to(top).as_posix() for item in top.rglob("*") if item.is_file()]
-        parts = {name: PurePosixPath(name).parts for name in names}
-        # A forged archive may call a member "" or ".": no file.
-        real = (name for name in names if parts[name] and not parts[name][-1].startswith("._"))
-        return sorted(name for name in real if "__MACOSX" not in parts[name])
-
-    def bvh_files(self) -> list[str]:
-        """Return the relative paths of all BVH files, sorted."""
-        return [name for name in self.names() if PurePosixPath(name).suffix.lower() == ".bvh"]
-
-    def read(self, name: str) -> bytes:
-        """Return a file's bytes; ValueError names archive and file if they cannot be had."""
-        try:
-            return self._zip().read(name) if self.is_zip else (Path(self.path) / name).read_bytes()
-        except Exception as error:  # whatever a damaged member of a zip, or a file that went away, raises
-            raise ValueError(f"{self.label(name)}: damaged, nothing of it is used ({error}); fetch it again") from error
-
-    def size_and_crc(self, name: str) -> tuple[int, int]:
-        """Return a file's size and CRC-32: from a zip's directory, or by reading a plain file."""
-        if self.is_zip:
-            info = self._zip().getinfo(name)
-            return info.file_size, info.CRC
-        data = self.read(name)
-        return len(data), zlib.crc32(data)
-
-    def label(self, name: str) -> str:
-        return f"{self.path}: {name}"
+def _list_files(place: Path) -> dict[str, _File]:
+    """Return the files that are read by their relative paths, sorted, without macOS's `._` forks and `__MACOSX`."""
+    if place.is_file():
+        opened = _open_zip(place)
+        found = {info.filename: (functools.partial(opened.read, info), info) for info in opened.infolist()}
+    else:
+        found = {item.relative_to(place).as_posix(): (item.read_bytes,) for item in place.rglob("*") if item.is_file()}
+    paths = {name: PurePosixPath(name) for name in sorted(found)}
+    real = lambda path: not path.name.startswith("._") and "__MACOSX" not in path.parts
+    read = (name for name, path in paths.items() if path.suffix.lower() in _READ and real(path))
+    return {name: _File(f"{place}: {name}", *found[name]) for name in read}
 
 
-def _find_archive(name: str, path) -> _Archive:
-    """Choose where a data set is read from: `path`, then F3AMD_DATA_DIR, then the download.
+def _find_files(name: str, path) -> tuple[Path, dict[str, _File]]:
+    """Choose where a data set is read from: `path`, then F3AMD_DATA_DIR, then the download; list what is there.
 
     In a folder the zip with the data set's name in its own wins over unpacked files.
     """
@@ -319,13 +311,17 @@ def _find_archive(name: str, path) -> _Archive:
     if place.is_file() and place.suffix.lower() in _READ:
         raise ValueError(f"{place}: is a single file; name the folder that it lies in")
     if place.is_dir() and name != "folder":
-        zips = [item for item in sorted(place.glob("*.[zZ][iI][pP]")) if name in item.name.lower() and item.is_file()]
-        zips = [item for item in zips if not item.name.startswith("._")]
+        zips = [item for item in sorted(place.glob("[!.]*.[zZ][iI][pP]")) if name in item.name.lower()]
         if len(zips) > 1:
             what = f"several archives may be meant ({', '.join(item.name for item in zips)})"
             raise ValueError(f"{place}: {what}; point {DATA_DIR_VARIABLE} (or path=...) at one of them")
         place = (zips or [place])[0]
-    return _Archive(str(place))
+    return place, _list_files(place)
+
+
+def _by_stem(files: Mapping[str, _File]) -> dict[str, _File]:
+    """Return files by their names without folder and ending."""
+    return {PurePosixPath(name).stem: file for name, file in files.items()}
 
 
 def _download(name: str) -> str:
@@ -380,9 +376,9 @@ def _keep_styles(dataset: Dataset, num_styles: int) -> Dataset:
 # --- loaders --------------------------------------------------------------------------------------
 
 
-def _read_take(archive: _Archive, member: str, expected: tuple[int, int], sha256_prefix="", cut=None) -> Motion:
-    """Read one file of an archive, check its bytes, and cut a range of 30 fps frames out."""
-    data, label = archive.read(member), archive.label(member)
+def _read_take(file: _File, expected: tuple[int, int], sha256_prefix="", cut=None) -> Motion:
+    """Read one file, check its bytes, and cut a range of 30 fps frames out."""
+    data, label = file.read(), file.label
     sound = (len(data), zlib.crc32(data)) == expected
     if not (sound and hashlib.sha256(data).hexdigest().startswith(sha256_prefix)):
         raise ValueError(f"{label}: is not the file that it should be, nothing of it is used; fetch it again")
@@ -457,13 +453,13 @@ def _bandai_list(path: Path) -> pd.DataFrame:
 
 def _open_bandai(path, locomotion_only: bool) -> Dataset:
     """List the Bandai clips of an archive; each file must agree with the committed list when it is read."""
-    archive = _find_archive("bandai", path)
+    place, files = _find_files("bandai", path)
     known = _bandai_list(_BANDAI_FILES)
     listed = known[known["is_locomotion"]] if locomotion_only else known
-    members = {PurePosixPath(file).stem: file for file in archive.bvh_files()}
+    members = _by_stem(files)
     if missing := sorted(set(listed.index) - set(members)):
         what = f"{len(missing)} of the {len(listed)} Bandai files needed are missing, the first is {missing[0]}.bvh"
-        raise ValueError(f"{archive.path}: {what}; fetch the whole archive again")
+        raise ValueError(f"{place}: {what}; fetch the whole archive again")
     # Locomotion and other clips are split apart, so that a clip's split does not depend on
     # `locomotion_only`. Clips too short for a window reach no split at all once packed, so they
     # must not take a place in validation or test.
@@ -473,7 +469,7 @@ def _open_bandai(path, locomotion_only: bool) -> Dataset:
     clips = []
     for item in listed.sort_index().itertuples():
         expected = (item.size, int(item.crc32, 16))
-        loader = functools.partial(_read_take, archive, members[item.name], expected, item.sha256_prefix)
+        loader = functools.partial(_read_take, members[item.name], expected, item.sha256_prefix)
         clips.append(Clip(item.name, item.style, item.content, splits[item.name], loader))
     content = list(zip(listed["name"], listed["sha256_prefix"], strict=True))
     of_part_2 = lambda style: style.startswith("2-")
@@ -485,9 +481,9 @@ _100STYLE_CODES = ("BR", "BW", "FR", "FW", "ID", "SR", "SW", "TR1", "TR2", "TR3"
 
 def _open_100style(path) -> Dataset:
     """List the takes of 100STYLE inside the ranges of its Frame_Cuts.csv."""
-    archive = _find_archive("100style", path)
-    cuts, symmetric = _read_frame_cuts(archive), _read_symmetric(archive)
-    members = {PurePosixPath(file).stem: file for file in archive.bvh_files()}
+    place, files = _find_files("100style", path)
+    members = _by_stem(files)
+    cuts, symmetric = _read_frame_cuts(place, files), _read_symmetric(place, files)
     # A transition take may be called TR for TR1, as in the author's own exporter.
     for style, _ in cuts:
         if f"{style}_TR1" not in members and f"{style}_TR" in members:
@@ -500,39 +496,39 @@ def _open_100style(path) -> Dataset:
         if name in members:
             # START and STOP count 60 fps frames. Halving the file and cutting at START//2, STOP//2 is
             # the same as cutting at even frames of the original and then halving.
-            there, cut = archive.size_and_crc(members[name]), (start // 2, stop // 2)
-            loader = functools.partial(_read_take, archive, members[name], there, cut=cut)
+            there, cut = members[name].size_and_crc(), (start // 2, stop // 2)
+            loader = functools.partial(_read_take, members[name], there, cut=cut)
             clips.append(Clip(name, style, code, splits[name], loader))
             content.append((name, *there, start, stop))
     missing = [name for name in splits if name not in members]
     if not clips:
         what = f"none of the {len(missing)} files that Frame_Cuts.csv names is there"
-        raise ValueError(f"{archive.path}: {what}; fetch the whole of 100STYLE ({_SETS['100style']['url']})")
+        raise ValueError(f"{place}: {what}; fetch the whole of 100STYLE ({_SETS['100style']['url']})")
     if missing:
         what = f"{len(missing)} of {len(cuts)} takes of 100STYLE are missing, such as {missing[0]}.bvh"
-        warnings.warn(f"{archive.path}: {what}; the data set goes without them", stacklevel=3)
+        warnings.warn(f"{place}: {what}; the data set goes without them", stacklevel=3)
     clips.sort(key=lambda clip: clip.name)
     return _dataset("100style", clips, sorted(content), mirror=symmetric.__contains__)
 
 
-def _read_table(archive: _Archive, table: str, columns: list[str]) -> tuple[str, pd.DataFrame]:
+def _read_table(place: Path, files: Mapping[str, _File], table: str, columns: list[str]) -> tuple[str, pd.DataFrame]:
     """Return where a table of 100STYLE lies, for messages, and these columns of it, as text."""
-    places = [name for name in archive.names() if PurePosixPath(name).name == table]
-    if len(places) != 1:
-        how = f"is there {len(places)} times ({', '.join(places)})" if places else "is missing"
+    found = [file for name, file in files.items() if PurePosixPath(name).name == table]
+    if len(found) != 1:
+        how = f"is there {len(found)} times" if found else "is missing"
         what = "the folder or zip must hold one copy of the data set, with its tables"
-        raise ValueError(f"{archive.path}: {table} of 100STYLE {how}; {what} ({_SETS['100style']['url']})")
-    label, content = archive.label(places[0]), io.BytesIO(archive.read(places[0]))
+        raise ValueError(f"{place}: {table} of 100STYLE {how}; {what} ({_SETS['100style']['url']})")
+    label, content = found[0].label, io.BytesIO(found[0].read())
     try:
         return label, pd.read_csv(content, usecols=columns, dtype=str, encoding="utf-8-sig", skip_blank_lines=False)
     except ValueError as error:
         raise ValueError(f"{label}: is not the table that it should be ({error}); fetch it again") from error
 
 
-def _read_frame_cuts(archive: _Archive, table: str = "Frame_Cuts.csv") -> dict[tuple[str, str], tuple[int, int]]:
+def _read_frame_cuts(place: Path, files: Mapping[str, _File]) -> dict[tuple[str, str], tuple[int, int]]:
     """Return (style, code) -> (START, STOP), in 60 fps frames; absent ranges (N/A) are left out."""
     columns = ["STYLE_NAME", *(f"{code}_{end}" for code in _100STYLE_CODES for end in ("START", "STOP"))]
-    (label, rows), cuts = _read_table(archive, table, columns), {}
+    (label, rows), cuts = _read_table(place, files, "Frame_Cuts.csv", columns), {}
     for line, row in enumerate(rows.to_dict("records"), start=2):
         for code in _100STYLE_CODES:
             style, start, stop = (str(row[name]).strip() for name in ("STYLE_NAME", f"{code}_START", f"{code}_STOP"))
@@ -545,34 +541,35 @@ def _read_frame_cuts(archive: _Archive, table: str = "Frame_Cuts.csv") -> dict[t
     return cuts
 
 
-def _read_symmetric(archive: _Archive, table: str = "Dataset_List.csv") -> set[str]:
+def _read_symmetric(place: Path, files: Mapping[str, _File]) -> set[str]:
     """Return the styles that stay themselves in a mirror."""
-    _, rows = _read_table(archive, table, ["Style Name", "Symmetric"])
+    _, rows = _read_table(place, files, "Dataset_List.csv", ["Style Name", "Symmetric"])
     return set(rows["Style Name"][rows["Symmetric"].str.strip() == "Yes"].str.strip())
 
 
 def _open_folder(path, retarget: bool, person: Mapping) -> Dataset:
     """List every BVH file of a folder; style is the sub-folder, or the name up to a "_"."""
-    archive = _find_archive("folder", path)
+    place, files = _find_files("folder", path)
     labelled = {}
-    for member in archive.bvh_files():
-        relative = PurePosixPath(member)
-        name = unicodedata.normalize("NFC", relative.with_suffix("").as_posix())
+    for member, file in files.items():
+        if not member.lower().endswith(".bvh"):
+            continue
+        name = unicodedata.normalize("NFC", PurePosixPath(member).with_suffix("").as_posix())
         if name in labelled:
-            raise ValueError(f"{archive.label(member)}: two files differ only in the case of their suffix; rename one")
+            raise ValueError(f"{file.label}: two files differ only in the case of their suffix; rename one")
         *_, style, content = ("", *name.split("/"))
         if not style:
             style, _, content = content.partition("_")
-        labelled[name] = (member, style, content)
+        labelled[name] = (file, style, content)
     if not labelled:
-        raise ValueError(f"{archive.path}: holds no .bvh file; choose a folder with motion files")
+        raise ValueError(f"{place}: holds no .bvh file; choose a folder with motion files")
     splits = assign_splits((name, style) for name, (_, style, _) in labelled.items())
     clips, identities = [], []
-    for name, (member, style, content) in sorted(labelled.items()):
+    for name, (file, style, content) in sorted(labelled.items()):
         there = (0, 0)
         with contextlib.suppress(ValueError):  # said when it is read
-            there = archive.size_and_crc(member)
-        loader = functools.partial(_read_take, archive, member, there)
+            there = file.size_and_crc()
+        loader = functools.partial(_read_take, file, there)
         clips.append(Clip(name, style, content, splits[name], loader, person))
         identities.append((name, *there))
     # As before, where nothing is asked for: trainings go on.
