@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from builders import refused
+from f3amd_notebooks.stored_result import stored_result
 from matplotlib.colors import to_rgb
 from PIL import Image
 
@@ -194,10 +195,10 @@ def test_markdown_has_units_dashes_and_alignment():
 
 def test_a_stored_result_is_shown_with_its_origin(tmp_path, monkeypatch):
     monkeypatch.setattr(stored, "repository_root", lambda: tmp_path)
-    assert "No stored `02_any` of `laptop` on `synthetic` yet" in stored.stored_result("synthetic", "02_any")
+    assert "No stored `02_any` of `laptop` on `synthetic` yet" in stored_result("synthetic", "02_any")
     told, path = record(), tmp_path / "paper_figures/synthetic/laptop/tables/02_any.csv"
     records.write_table(path, pd.DataFrame({"model": ["a"], "value": [1.23456]}), told)
-    shown = stored.stored_result("synthetic", "02_any")
+    shown = stored_result("synthetic", "02_any")
     assert f"data {told['dataset']}, {counted_cores(told)}" in shown and told["date_utc"][:10] in shown
     assert "| a     |  1.23 |" in shown
 

@@ -41,7 +41,7 @@ from flax import nnx
 from f3amd_lib.diffusion.flow import network_time
 from f3amd_lib.ground.files import read_toml, write_whole
 from f3amd_lib.ground.names import check_known
-from f3amd_lib.ground.trees import file_kind
+from f3amd_lib.ground.trees import describe
 from f3amd_lib.motion.skeleton import describe_skeleton
 from f3amd_lib.networks.conditioning import PATH_CHANNELS, Condition, ConditionedConfig
 from f3amd_lib.text.networks.acmdm import ACMDMConfig, TextCondition
@@ -223,7 +223,7 @@ def largest_difference(program: bytes, network, levels) -> float:
 
 def load_text_or_latent(path) -> TextModel | LatentModel | None:
     """Read a model of text to motion; None for a weights file of another kind, ValueError for one that is damaged."""
-    return load_text_model(path) if file_kind(path) in (TextModel.kind, LatentModel.kind) else None
+    return load_text_model(path) if describe(path).get("kind") in (TextModel.kind, LatentModel.kind) else None
 
 
 def asked_at(trained: TextModel | LatentModel, num_steps: int) -> dict[str, list[float]]:

@@ -2,33 +2,26 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pandas as pd
 
 from f3amd_lib.ground.names import counted_cores
 from f3amd_lib.ground.profiles import repository_root
 from f3amd_lib.ground.records import folder_reason, read_table
-from f3amd_lib.ground.tables import markdown_table
 
 
-def _committed(dataset: str, profile: str, kind: str, name: str) -> Path | None:
-    """Return where a table lies, "records" or "tables"; None where it does not."""
-    path = repository_root() / "paper_figures" / dataset / profile / kind / f"{name}.csv"
-    return path if path.exists() else None
-
-
-def _machine(record: dict) -> str:
+def machine_of(record: dict) -> str:
+    """Return on what a record was made, and when: "2 cores (cpu), 2026-11-28."."""
     return f"{counted_cores(record)} ({record['device_platform']}), {record['date_utc'][:10]}."
 
 
-def committed_table(dataset: str, name: str, *, profile: str = "laptop") -> tuple[pd.DataFrame, dict] | None:
+def committed_table(dataset: str, name: str, *, profile="laptop", kind="records") -> tuple[pd.DataFrame, dict] | None:
     """Read a table that `make measure` left under `paper_figures/`.
 
     Args:
       dataset: a name of `profiles.DATASETS`.
       name: of the table, without ending.
       profile: whose results.
+      kind: "records", or "tables" for those that `make figures` left.
 
     Returns:
       (table, record), or None if nothing is committed for this data set. `table.attrs["stale"]`
@@ -37,7 +30,8 @@ def committed_table(dataset: str, name: str, *, profile: str = "laptop") -> tupl
     Raises:
       ValueError: if the table is not the one that its record describes.
     """
-    if (path := _committed(dataset, profile, "records", name)) is None:
+    path = repository_root() / "paper_figures" / dataset / profile / kind / f"{name}.csv"
+    if not path.exists():
         return None
     table, record = read_table(path)
     table.attrs["stale"] = folder_reason(path, record)
@@ -61,17 +55,8 @@ def measured_table(dataset: str, name: str, measurement: str) -> tuple[pd.DataFr
         return None, f"Not measured yet: `{name}`. `make measure MEASURE={measurement} DATA=bandai` measures it."
     table, record = found
     table.attrs["dataset"] = record["dataset"]
-    where = f"data {record['dataset']}, profile {record['profile']}, {_machine(record)}"
+    where = f"data {record['dataset']}, profile {record['profile']}, {machine_of(record)}"
     sentence = f"Stored result `{name}`: {where} {record['dataset_credit'] or ''}"
     if table.attrs["stale"]:
         sentence = f"**Stale: {table.attrs['stale']}; measure it again.** {sentence}"
     return table, sentence.strip()
-
-
-def stored_result(dataset: str, name: str) -> str:
-    """Return a table that `make figures` left as Markdown, and a line on its origin; or that there is none yet."""
-    if (path := _committed(dataset, "laptop", "tables", name)) is None:
-        return f"No stored `{name}` of `laptop` on `{dataset}` yet: `make figures` makes it."
-    frame, record = read_table(path)
-    where = f"profile {record['profile']}, data {record['dataset']}, {_machine(record)}"
-    return f"Stored result: `{name}`, {where}\n\n{markdown_table(frame, digits=2)}"

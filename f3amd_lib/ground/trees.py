@@ -138,11 +138,6 @@ def _with_rest(template: dict, arrays: dict) -> dict:
     return tree
 
 
-def file_kind(path) -> str | None:
-    """Return what a weights file says that it holds, such as "trained model"; ValueError if it cannot be read."""
-    return _read(Path(path))[1].get("kind")
-
-
 def weights_digest(params: Any) -> str:
     """Return 12 hex digits that tell one set of weights from another."""
     return _checksum(_named_leaves(params), "")[:12]
