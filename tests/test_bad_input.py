@@ -22,6 +22,7 @@ from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.trees import describe, load_tree, save_tree
 from f3amd_lib.measures.metrics import camdm_metrics, camdm_orientation_error
 from f3amd_lib.motion.bvh import format_bvh, parse_bvh
+from f3amd_lib.motion.plausible import as_person
 from f3amd_lib.motion.root_paths import named_path, read_path_csv
 from f3amd_lib.motion.skeleton import Skeleton, facing_yaw
 from f3amd_lib.rollout.rollout import MOST_STEPS, MotionGenerator
@@ -49,7 +50,7 @@ def test_absurd_bvh_is_refused_with_its_line(old, new, line):
 
 @pytest.mark.parametrize("scale", [0.0, -1.0, np.nan, np.inf])
 def test_a_scale_that_makes_no_body_is_refused(scale):
-    refused("scale must be positive", parse_bvh, TEXT, "walk.bvh", scale)
+    refused("scale must be positive", as_person, parse_bvh(TEXT, "walk.bvh"), scale=scale)
 
 
 @pytest.mark.parametrize(

@@ -40,31 +40,24 @@ def fit_rotations(skeleton: Skeleton, positions):
         bones = children[np.linalg.norm(skeleton.offsets[children], axis=-1) > _NO_LENGTH]
         wanted = positions[:, bones] - placed[joint][:, None]
         wanted = xp.sum(wanted[..., None] * above[:, None], axis=-2)  # in the parent's frame
-        local.append(_aimed(skeleton.offsets[bones].astype(positions.dtype), wanted) if len(bones) else start)
+        local.append(aimed(skeleton.offsets[bones].astype(positions.dtype), wanted) if len(bones) else start)
         turned.append(compose(above, local[joint]))
     local = xp.stack(local, axis=1)
     left = xp.mean(positions - forward_kinematics(skeleton, positions[:, 0], local), axis=1)
     return positions[:, 0] + left, local
 
 
-def _aimed(offsets: np.ndarray, wanted):
-    """Return rotations [T, 3, 3] that turn offsets [K, 3] towards wanted [T, K, 3], both in the parent's frame."""
-    xp = array_module(wanted)
-    if len(offsets) == 1:
-        direction = wanted[:, 0]
-        nowhere = xp.linalg.norm(direction, axis=-1, keepdims=True) < _NO_LENGTH
-        return shortest_turn(offsets, xp.where(nowhere, offsets, direction))
-    return best_turns(offsets, wanted, _PULL)
-
-
-def best_turns(was: np.ndarray, shall, pull: float = 0.0):
+def aimed(was: np.ndarray, shall):
     """Return the rotations [T, 3, 3] that bring vectors [K, 3] nearest to others, [T, K, 3] (Kabsch 1976).
 
-    With a `pull` (m^2) no rotation at all is preferred where the vectors leave one open.
+    A single one takes the smallest turn; where several leave a rotation open, none at all is preferred.
     """
     xp = array_module(shall)
+    if len(was) == 1:
+        nowhere = xp.linalg.norm(shall[:, 0], axis=-1, keepdims=True) < _NO_LENGTH
+        return shortest_turn(was, xp.where(nowhere, was, shall[:, 0]))
     spread = xp.sum(shall[..., :, None] * was[:, None, :], axis=1)
-    left, _, right = xp.linalg.svd(spread + pull * np.eye(3, dtype=was.dtype))
+    left, _, right = xp.linalg.svd(spread + _PULL * np.eye(3, dtype=was.dtype))
     sign = xp.linalg.det(left) * xp.linalg.det(right)
     left = left * xp.stack([xp.ones_like(sign), xp.ones_like(sign), sign], axis=-1)[:, None]
     return compose(left, right)

@@ -16,8 +16,7 @@ import numpy as np
 
 from f3amd_lib.motion.anatomy import leg_length
 from f3amd_lib.motion.curves import unit
-from f3amd_lib.motion.inverse_kinematics import best_turns
-from f3amd_lib.motion.rotations import shortest_turn
+from f3amd_lib.motion.inverse_kinematics import aimed
 from f3amd_lib.motion.skeleton import Motion, Skeleton, global_rotations, local_rotations
 
 log = logging.getLogger("f3amd")
@@ -69,10 +68,7 @@ def retarget(motion: Motion, reference: Motion) -> tuple[Motion, float, np.ndarr
             continue
         was = unit(np.array([bones[joint][child] for child in aims]) @ rest[joint].T)
         shall = unit(np.stack([*aims.values()], axis=1))
-        if len(aims) > 1:
-            turned[:, joint] = best_turns(was, shall)
-        else:
-            turned[:, joint] = shortest_turn(before @ was[0], shall[:, 0]) @ before
+        turned[:, joint] = before @ aimed(was, shall @ before)
     local = local_rotations(skeleton, turned @ rest)
     scale = leg_length(skeleton, ours) / leg_length(motion.skeleton, theirs)
     made = Motion(skeleton, scale * motion.positions[:, theirs["hips"]], local, motion.fps, motion.name)

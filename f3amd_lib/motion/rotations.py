@@ -81,19 +81,6 @@ def rotation_6d_from_yaw(yaw):
     return rotation_6d_from_matrix(matrix_from_yaw(yaw))
 
 
-def yaw_from_direction(direction):
-    """Return the yaw of a direction on the ground plane.
-
-    Args:
-      direction: vectors [..., 3]; the height is ignored.
-
-    Returns:
-      Yaw in radians, [...], 0 for +Z and +pi/2 for +X.
-    """
-    xp = array_module(direction)
-    return xp.arctan2(direction[..., 0], direction[..., 2])
-
-
 def wrap_angle(angle):
     """Map angles to [-pi, pi), radians, any shape."""
     xp = array_module(angle)

@@ -82,10 +82,6 @@ class Skeleton:
             raise ValueError(f"no joint is known as its {role}; call one of them so: {', '.join(self.names)}")
         return self.roles[role]
 
-    def has_role(self, role: str) -> bool:
-        """Say whether a joint is known to play a role."""
-        return role in self.roles
-
     @property
     def toes(self) -> tuple[int, int]:
         """Indices of the left and the right toe joint."""
@@ -163,8 +159,7 @@ def describe_skeleton(skeleton: Skeleton) -> dict:
 
 def described_skeleton(metadata: dict, offsets) -> Skeleton:
     """Return the skeleton that `describe_skeleton` described, with its offsets [J, 3]."""
-    end_sites = tuple((joint, tuple(offset)) for joint, offset in metadata["end_sites"])
-    return Skeleton(tuple(metadata["joints"]), tuple(metadata["parents"]), np.asarray(offsets, np.float64), end_sites)
+    return Skeleton(metadata["joints"], metadata["parents"], np.asarray(offsets), metadata["end_sites"])
 
 
 @dataclass(frozen=True, eq=False)
@@ -342,7 +337,7 @@ def facing_yaw(skeleton: Skeleton, positions, *, shoulders: bool = False):
         return positions[..., skeleton.role(f"left_{part}"), :] - positions[..., skeleton.role(f"right_{part}"), :]
 
     across = between("hip")
-    if shoulders and skeleton.has_role("left_collar") and skeleton.has_role("right_collar"):
+    if shoulders and {"left_collar", "right_collar"} <= set(skeleton.roles):
         unit = lambda vector: vector / xp.maximum(xp.linalg.norm(vector, axis=-1, keepdims=True), 1e-9)
         across = unit(across) + unit(between("collar"))
     # The direction is cross(a, +Y) = (-a_z, 0, a_x).

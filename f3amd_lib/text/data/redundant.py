@@ -71,14 +71,14 @@ def smoothed_yaw(
         released code takes the left hip for the right one.
     """
     across = positions[:, skeleton.role("left_hip")] - positions[:, skeleton.role("right_hip")]
-    if skeleton.has_role("left_shoulder") and skeleton.has_role("right_shoulder"):
+    if {"left_shoulder", "right_shoulder"} <= set(skeleton.roles):
         shoulders = positions[:, skeleton.role("left_shoulder")] - positions[:, skeleton.role("right_shoulder")]
         across = shoulders + (-across if released else across)
     forward = np.stack([-across[:, 2], 0 * across[:, 0], across[:, 0]], axis=-1)
     forward = forward / np.linalg.norm(across if released else forward, axis=-1, keepdims=True)
     if smoothing:
         forward = gaussian_filter1d(forward, smoothing, axis=0, mode="nearest")
-    return rotations.yaw_from_direction(forward)
+    return np.arctan2(forward[:, 0], forward[:, 2])
 
 
 def canonical_start(skeleton: Skeleton, positions) -> np.ndarray:

@@ -307,7 +307,7 @@ def _normaliser(arrays: dict | None) -> AxisNormaliser | None:
 
 def controlled_joints(skeleton: Skeleton) -> dict[str, int]:
     """Return the joints that a branch learns to control, by their names on the command line; the pelvis is the root."""
-    return {"pelvis": 0} | {name: skeleton.role(role) for name, role in CONTROLLED.items() if skeleton.has_role(role)}
+    return {"pelvis": 0} | {name: skeleton.role(role) for name, role in CONTROLLED.items() if role in skeleton.roles}
 
 
 def preset_and_branch(name: str) -> tuple[str, str]:
