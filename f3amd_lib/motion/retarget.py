@@ -13,6 +13,7 @@ Source: ours.
 import logging
 
 import numpy as np
+from scipy.interpolate import make_interp_spline
 
 from f3amd_lib.motion.anatomy import leg_length
 from f3amd_lib.motion.curves import unit
@@ -115,13 +116,7 @@ def _wanted_points(motion: Motion, theirs, skeleton: Skeleton, ours) -> dict[int
     walked = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=-1).mean(axis=-1))])
     own = sorted((role for role in ours if role.startswith("spine_")), key=lambda role: int(role[6:]))
     lengths = np.cumsum([np.linalg.norm(skeleton.offsets[ours[role]]) for role in (*own, "neck")])
-    points = {}
-    for role, joint in ours.items():
-        if role in own:
-            along = walked[-1] * lengths[own.index(role)] / lengths[-1]
-            after = min(max(int(np.searchsorted(walked, along)), 1), len(line) - 1)
-            share = (along - walked[after - 1]) / max(walked[after] - walked[after - 1], 1e-9)
-            points[joint] = (1.0 - share) * line[after - 1] + share * line[after]
-        elif role in place:
-            points[joint] = place[role]
-    return points
+    walked += 1e-9 * np.arange(len(walked))  # bones of no length, too
+    along = make_interp_spline(walked, line, k=1)(walked[-1] * lengths / lengths[-1])
+    place |= dict(zip(own, along, strict=False))
+    return {joint: place[role] for role, joint in ours.items() if role in place}
