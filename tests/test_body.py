@@ -8,9 +8,9 @@ from scipy.spatial import cKDTree
 from test_skeleton import BANDAI, legs, random_motion
 
 from f3amd_lib.motion.anatomy import joint_roles
-from f3amd_lib.motion.body import SIDES, body_capsules, capsule_mesh, make_body, pose_body
 from f3amd_lib.motion.skeleton import Skeleton, global_rotations, mirror
 from f3amd_lib.motion.synthetic import SYNTHETIC_SKELETON
+from f3amd_lib.text.data.body import SIDES, body_capsules, capsule_mesh, make_body, pose_body
 
 RIGS = pytest.mark.parametrize("rig", [SYNTHETIC_SKELETON, BANDAI], ids=["100style-like", "bandai"])
 

@@ -8,8 +8,8 @@ from builders import SKELETON, wandering_motion
 from scipy.spatial.transform import Rotation
 
 from f3amd_lib.motion import synthetic
-from f3amd_lib.motion.body import make_body, pose_body
 from f3amd_lib.motion.skeleton import Skeleton
+from f3amd_lib.text.data.body import make_body, pose_body
 from f3amd_lib.text.data.body_mesh import BodyMesh, body_distances, joint_weights, mesh_lists, standing
 from f3amd_lib.text.judge.text_metrics import laplacian_surface_distance
 

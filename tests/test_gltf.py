@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 from test_skeleton import BANDAI, random_motion
 
 from f3amd_companion.serving.motion_files import write_glb, write_motion_csv
-from f3amd_lib.motion.body import make_body, pose_body
 from f3amd_lib.motion.skeleton import Motion, Skeleton
 from f3amd_lib.motion.synthetic import SYNTHETIC_SKELETON
+from f3amd_lib.text.data.body import make_body, pose_body
 
 SIZES = {"SCALAR": (), "VEC3": (3,), "VEC4": (4,), "MAT4": (4, 4)}
 TYPES = {5121: "<u1", 5123: "<u2", 5125: "<u4", 5126: "<f4"}

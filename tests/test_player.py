@@ -16,11 +16,11 @@ from scipy.spatial.transform import Rotation
 from f3amd_companion.serving import player
 from f3amd_companion.serving.player import FOLDER, Character, Scene, player_page, rollout_scene, write_player
 from f3amd_lib.drawing.stick_figures import limb_side
-from f3amd_lib.motion.body import body_capsules, make_body
 from f3amd_lib.motion.root_paths import RootPath, named_path, path_from_motion
 from f3amd_lib.motion.skeleton import Motion, Skeleton
 from f3amd_lib.motion.synthetic import SYNTHETIC_SKELETON
 from f3amd_lib.rollout.rollout import Rollout
+from f3amd_lib.text.data.body import body_capsules, make_body
 
 FRAMES = 40
 
@@ -144,7 +144,7 @@ def test_every_bone_is_described_once_with_its_side_and_the_body_is_pythons():
 
 @pytest.mark.needs("node")
 def test_the_pages_own_body_has_the_vertices_of_pythons(tmp_path):
-    """body.js in Node, with the bundled three.js: the same mesh as motion/body.py."""
+    """body.js in Node, with the bundled three.js: the same mesh as text/data/body.py."""
     for name in ("body", "scene"):
         text = (FOLDER / f"{name}.js").read_text().replace('from "three"', 'from "./three.mjs"')
         (tmp_path / f"{name}.mjs").write_text(text)

@@ -1,7 +1,7 @@
 """Motion in the files of others: BVH, glTF 2.0 (`.glb`), and a table that any program reads.
 
 glTF has skeleton, skin and animation in one file, which engines and Blender open. A character has joints, a skin and a
-mesh (`motion.body`). Units are metres, +Y is up, and with yaw 0 it faces +Z: glTF's own conventions. Rotations are
+mesh (`text.data.body`). Units are metres, +Y is up, and with yaw 0 it faces +Z: glTF's own conventions. Rotations are
 quaternions (x, y, z, w) without jumps of sign.
 
 Source: Khronos Group, glTF 2.0 specification, sections 3.6 (accessors), 3.7.3 (skins), 3.11 (animations).
@@ -15,9 +15,9 @@ import pygltflib as gltf
 from scipy.spatial.transform import Rotation
 
 from f3amd_lib.ground.files import named_file, write_whole
-from f3amd_lib.motion.body import make_body
 from f3amd_lib.motion.bvh import write_bvh
 from f3amd_lib.motion.skeleton import Motion
+from f3amd_lib.text.data.body import make_body
 
 _COMPONENTS = {"u1": gltf.UNSIGNED_BYTE, "u2": gltf.UNSIGNED_SHORT, "u4": gltf.UNSIGNED_INT, "f4": gltf.FLOAT}
 _KINDS = {(): gltf.SCALAR, (3,): gltf.VEC3, (4,): gltf.VEC4, (4, 4): gltf.MAT4}

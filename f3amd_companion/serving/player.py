@@ -37,8 +37,8 @@ from f3amd_lib.drawing import stick_figures
 from f3amd_lib.drawing.pictures import film_strip
 from f3amd_lib.drawing.style import save_figure
 from f3amd_lib.ground.files import named_file, write_whole
-from f3amd_lib.motion.body import body_capsules
 from f3amd_lib.motion.skeleton import Motion, Skeleton
+from f3amd_lib.text.data.body import body_capsules
 
 FOLDER = Path(__file__).parent / "web"
 """Scripts, styles and templates of pages. The modules import each other by name."""

@@ -1,4 +1,4 @@
-// Characters: bones, a body of capsules (as motion/body.py makes it), or sticks.
+// Characters: bones, a body of capsules (as text/data/body.py makes it), or sticks.
 //
 // A skeleton is { names, parents, offsets: [[x, y, z]], capsules: [[joint, start, end, radii, wide]],
 // bones: [[joint, [x, y, z], side]], head, toes }, in metres; the sides are "left", "right", "middle".

@@ -18,9 +18,9 @@ from scipy.sparse.csgraph import shortest_path
 from scipy.spatial.distance import cdist
 
 from f3amd_lib.ground.arrays import array_module
-from f3amd_lib.motion.body import Body, make_body, pose_body
 from f3amd_lib.motion.inverse_kinematics import fit_rotations
 from f3amd_lib.motion.skeleton import Skeleton
+from f3amd_lib.text.data.body import Body, make_body, pose_body
 
 
 class MeshLists(NamedTuple):

@@ -21,8 +21,8 @@ from f3amd_lib.diffusion.predictions import clean_estimate, prediction_target
 from f3amd_lib.diffusion.schedules import NoiseSchedule
 from f3amd_lib.ground.arrays import in_batches
 from f3amd_lib.ground.trees import weights_digest
-from f3amd_lib.motion.body import make_body
 from f3amd_lib.networks import presets
+from f3amd_lib.text.data.body import make_body
 from f3amd_lib.text.data.body_mesh import BodyMesh, standing
 from f3amd_lib.text.data.text_motions import ClipTable, TextMotions, clip_table, draw_clips, pad_motions
 from f3amd_lib.text.networks.acmdm import (
