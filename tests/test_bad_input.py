@@ -50,7 +50,7 @@ def test_absurd_bvh_is_refused_with_its_line(old, new, line):
 
 @pytest.mark.parametrize("scale", [0.0, -1.0, np.nan, np.inf])
 def test_a_scale_that_makes_no_body_is_refused(scale):
-    refused("scale must be positive", as_person, parse_bvh(TEXT, "walk.bvh"), scale=scale)
+    refused("scale must be", as_person, parse_bvh(TEXT, "walk.bvh"), scale=scale)
 
 
 @pytest.mark.parametrize(

@@ -238,7 +238,7 @@ def test_broken_motions_are_refused_by_name_and_frame():
     refused(r"motion 'clip': rotations must be \[3, 5, 3, 3\]", Motion, legs(), root[:3], eye, name="clip")
     refused(r"rotations must be \[4, 5, 3, 3\]", Motion, legs(), root, eye[:, 1:])
     refused("no length 0", Motion, legs(), root[:0], eye[:0])
-    refused("fps must be positive, got 0", Motion, legs(), root, eye, fps=0)
+    refused("fps must be above 0, got 0", Motion, legs(), root, eye, fps=0)
     root[2, 1] = np.nan
     refused("motion 'clip': root_position is not finite at frame 2", Motion, legs(), root, eye, name="clip")
     eye[3, 1, 0, 0] = np.inf

@@ -83,18 +83,12 @@ def head_and_parent(skeleton: Skeleton) -> list[int] | None:
 
 def toes_of(skeleton: Skeleton) -> list[int]:
     """Return the left and the right toe, or none where they are not known."""
-    try:
-        return list(skeleton.toes)
-    except ValueError:
-        return []
+    return list(skeleton.toes) if {"left_toe", "right_toe"} <= set(skeleton.roles) else []
 
 
 def yaw_of(motion: Motion) -> np.ndarray | None:
     """Return where a motion faces, [T], radians, or None where the skeleton's hips are not known."""
-    try:
-        return motion.yaw
-    except ValueError:
-        return None
+    return motion.yaw if {"left_hip", "right_hip"} <= set(motion.skeleton.roles) else None
 
 
 def drawn_points(motion: Motion, frames: np.ndarray) -> np.ndarray:

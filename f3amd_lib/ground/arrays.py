@@ -17,12 +17,6 @@ def exact_products():
     return jax.default_matmul_precision("float32")
 
 
-def check_positive(name: str, value) -> None:
-    """Raise ValueError unless a number is finite and above 0."""
-    if not (np.isfinite(value) and value > 0):
-        raise ValueError(f"{name} must be positive, got {value}")
-
-
 def in_batches(function, count: int, size: int):
     """Return what a function makes of many rows, asked for a fixed number at a time.
 

@@ -36,8 +36,7 @@ _METRES = 0.01  # in a centimetre
 FRAME_TIMES = (1e-5, 1.0)
 """Shortest and longest time between frames, seconds."""
 
-_LONGEST_WORD = 200
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+_NUMBER = re.compile(r"[+-]?(\d++\.?\d*+|\.\d++)([eE][+-]?\d+)?", re.ASCII)
 _BRACES = "check that every '{' has its '}'"
 
 _NAMED = r"[ \t]+([^\s{}][^\n{}]*+)\s*+\{", "a name on the same line, then '{'"
@@ -148,7 +147,7 @@ def parse_bvh(text: str | bytes, name: str) -> Motion:
 
 def finite_number(word: str, largest: float = LARGEST_NUMBER) -> float | None:
     """Return a word as a float, or None if it is no decimal number of at most the largest, either way."""
-    value = float(word) if len(word) <= _LONGEST_WORD and _NUMBER.fullmatch(word) else np.nan
+    value = float(word) if _NUMBER.fullmatch(word) else np.nan
     return value if abs(value) <= largest else None
 
 

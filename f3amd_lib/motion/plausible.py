@@ -11,9 +11,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from f3amd_lib.ground.arrays import check_positive
 from f3amd_lib.ground.files import read_toml
-from f3amd_lib.ground.names import check_known
+from f3amd_lib.ground.names import check_known, checked_value
 from f3amd_lib.motion.anatomy import ROLES, leg_length
 from f3amd_lib.motion.curves import unit
 from f3amd_lib.motion.skeleton import Motion, Skeleton
@@ -57,7 +56,7 @@ def as_person(
     if up is not None:
         check_known(up, ("Y", "Z"), "axis that is up")
     if scale is not None:
-        check_positive("scale", scale)
+        checked_value("scale", scale, "float")
     notes, roles = [], motion.skeleton.roles
     legs = {"left_ankle", "right_ankle"} <= set(roles)
     if not legs and (scale is None or up is None):

@@ -15,8 +15,8 @@ from scipy.integrate import cumulative_trapezoid
 from scipy.ndimage import gaussian_filter1d
 from scipy.special import jn_zeros
 
-from f3amd_lib.ground.arrays import check_positive, finite_array
-from f3amd_lib.ground.names import check_known, checked_seed
+from f3amd_lib.ground.arrays import finite_array
+from f3amd_lib.ground.names import check_known, checked_seed, checked_value
 from f3amd_lib.ground.tables import read_text_table
 from f3amd_lib.motion.bvh import finite_number
 from f3amd_lib.motion.curves import smoothstep
@@ -56,7 +56,7 @@ class RootPath:
     def __post_init__(self):
         position = finite_array("path position", self.position, ("frame", 2)).copy()
         yaw = np.unwrap(finite_array("path yaw", self.yaw, (len(position),)))
-        check_positive("a path's fps", self.fps)
+        checked_value("a path's fps", self.fps, "float")
         for name, array in (("position", position), ("yaw", yaw)):
             array.setflags(write=False)
             object.__setattr__(self, name, array)
@@ -115,7 +115,7 @@ def named_path(name: str, num_frames: int, *, speed: float = 1.2, seed: int = 0,
     check_known(name, NAMES, "path")
     if int(num_frames) != num_frames or num_frames < 2:
         raise ValueError(f"a path needs at least 2 whole frames, got num_frames={num_frames}")
-    check_positive("fps", fps)
+    checked_value("fps", fps, "float")
     if not (np.isfinite(speed) and 0 < speed < MAX_STEP * 30.0):
         raise ValueError(f"speed must lie between 0 and {MAX_STEP * 30.0:g} m/s, got {speed}")
     num_frames, seed = int(num_frames), checked_seed(seed)

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from f3amd_lib.ground.arrays import array_module, check_positive, finite_array
+from f3amd_lib.ground.arrays import array_module, finite_array
+from f3amd_lib.ground.names import checked_value
 from f3amd_lib.motion.anatomy import joint_roles, side_of, twin_name
 from f3amd_lib.motion.rotations import matrix_from_yaw, slerp_matrices
 
@@ -201,7 +202,7 @@ class Motion:
         }
         for what, array in self._arrays().items():
             object.__setattr__(self, what, finite_array(f"{label}: {what}", array, shapes[what], dtype=None))
-        check_positive(f"{label}: fps", self.fps)
+        checked_value(f"{label}: fps", self.fps, "float")
 
     @classmethod
     def from_positions(cls, skeleton: Skeleton, positions, fps: float = 30.0, name: str = "") -> Motion:
@@ -400,7 +401,7 @@ def resample(motion: Motion, fps: float = 30.0) -> Motion:
     Returns:
       A motion at exactly `fps`. Positions are interpolated linearly, rotations on the shortest arc.
     """
-    check_positive("fps", fps)
+    checked_value("fps", fps, "float")
     ratio = motion.fps / fps
     if abs(ratio - round(ratio)) < 1e-3 and round(ratio) >= 1:
         every = {name: array[:: round(ratio)] for name, array in motion._arrays().items()}

@@ -26,9 +26,8 @@ from scipy.interpolate import CubicSpline, PchipInterpolator
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from f3amd_lib.ground.arrays import check_positive
 from f3amd_lib.ground.files import read_toml
-from f3amd_lib.ground.names import check_known
+from f3amd_lib.ground.names import check_known, checked_value
 from f3amd_lib.motion.curves import smooth_above, smoothstep, unit
 from f3amd_lib.motion.root_paths import RootPath
 from f3amd_lib.motion.rotations import matrix_from_euler, wrap_angle
@@ -473,7 +472,7 @@ def synthesize(style: str, seconds: float = 60.0, seed: int = 0, fps: float = 30
     Raises:
       ValueError: for an unknown style, or a length or rate that gives no frame.
     """
-    check_positive("fps", fps)
+    checked_value("fps", fps, "float")
     if not np.isfinite(seconds) or round(seconds * fps) < 1:
         raise ValueError(f"seconds must give at least one frame at {fps} fps, got {seconds}")
     return _walk(style, seed, fps, int(round(seconds * fps)))[0]
