@@ -224,7 +224,7 @@ def data(motion: Data) -> None:
 
     splits = packed.clip_split.tolist()
     split = ", ".join(f"{splits.count(number)} {name}" for number, name in enumerate(SPLITS))
-    log.info("data set     %s, %s; %s", packed.dataset, packed.licence, packed.credit)
+    log.info("data set     %s, %s; %s", packed.name, packed.licence, packed.credit)
     log.info("clips        %d (%d left out): %s", packed.num_clips, len(packed.skipped), split)
     log.info("frames       %d at 30 fps, of %d joints", packed.num_frames, packed.skeleton.num_joints)
     log.info("styles       %s", ", ".join(packed.styles))

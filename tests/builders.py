@@ -113,7 +113,7 @@ def packed_from(clips, *, styles=("calm", "proud"), mirror_styles=()) -> PackedM
         floor_shift=np.zeros(len(clips), np.float32),
         primary_styles=tuple(styles),
         mirror_styles=frozenset(mirror_styles),
-        dataset="tiny",
+        name="tiny",
         licence="none",
         credit="nobody",
         fingerprint="0" * 64,

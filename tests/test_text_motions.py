@@ -256,4 +256,4 @@ def test_bandai_vectors_go_back_to_the_same_positions(made):
 
 def test_captions_are_for_bandai(some_bandai):
     with pytest.raises(ValueError, match="composed for data set 'bandai', not for 'folder'"):
-        text_motions.bandai_text_motions(dataclasses.replace(some_bandai, dataset="folder"))
+        text_motions.bandai_text_motions(dataclasses.replace(some_bandai, name="folder"))

@@ -280,7 +280,7 @@ def _measure_walks(
     prepared: PreparedData, profile: Profile, models: Iterable[str] | None, name: str, treatments: Iterable[str]
 ) -> Path:
     """Measure rollouts on three short paths by `walking_figures`, each of them as treated."""
-    packed, styles, made = prepared.packed, _styles(prepared, profile), prepared.packed.dataset == "synthetic"
+    packed, styles, made = prepared.packed, _styles(prepared, profile), prepared.packed.name == "synthetic"
     num_frames = max(2, profile.rollout_frames // 4 // profile.window) * profile.window
     floors = {style: 0.0 if made else style_floor(packed, style) for style in styles}
     paths = {seed: evaluation_paths(packed, styles, num_frames, seed=seed) for seed in range(WALKING_SEEDS)}

@@ -160,5 +160,5 @@ def published_model(path, packed: PackedMotion) -> TrainedModel:
         name=NAME, config=config, params=nnx.state(network), normaliser=PublishedFeatures(),
         skeleton=packed.skeleton, styles=packed.styles, diffusion=presets.find_preset("CAMDM-K4").diffusion,
         start_poses=starting_poses(packed, num_history=NUM_HISTORY),
-        record={"dataset": packed.dataset, "dataset_licence": packed.licence, "dataset_credit": packed.credit},
+        record={"dataset": packed.name, "dataset_licence": packed.licence, "dataset_credit": packed.credit},
     )  # fmt: skip

@@ -15,7 +15,7 @@ import numpy as np
 import pooch
 
 from f3amd_lib.data.features import lowest_toe_height
-from f3amd_lib.data.sources import FPS, MINIMUM_FRAMES, SPLITS, Dataset, read_clips
+from f3amd_lib.data.sources import FPS, MINIMUM_FRAMES, SPLITS, DataCard, Dataset, read_clips
 from f3amd_lib.ground.trees import check_kind, errors_name, load_tree, save_tree
 from f3amd_lib.motion.rotations import matrix_from_rotation_6d, rotation_6d_from_matrix
 from f3amd_lib.motion.skeleton import Motion, Skeleton, describe_skeleton, described_skeleton
@@ -29,12 +29,11 @@ _KIND = f"packed data set of format {_FORMAT}"
 
 
 @dataclass(frozen=True, eq=False)
-class PackedMotion:
+class PackedMotion(DataCard):
     """All clips of a data set end to end: N frames, K clips, J joints, at 30 fps.
 
     Attributes:
       skeleton: the joints that all clips share.
-      styles: style labels; the index is the one-hot position.
       root_position: [N, 3] float32, metres.
       rotation_6d: [N, J, 6] float16, local rotations (the root's global).
       clip_start: [K + 1] int32; clip k is frames clip_start[k] to clip_start[k + 1] (excluded).
@@ -43,13 +42,10 @@ class PackedMotion:
       clip_split: [K] uint8; 0 train, 1 validation, 2 test.
       floor_shift: [K] float32, height of the lowest toe of each clip, metres. Nothing has been
         subtracted; contact rules that measure height subtract it.
-      primary_styles, mirror_styles: as in `Dataset`.
-      dataset, licence, credit, fingerprint: as in `Dataset` (its name, terms, credit, identity).
       skipped: (clip name, reason) of clips that were left out.
     """
 
     skeleton: Skeleton
-    styles: tuple[str, ...]
     root_position: np.ndarray
     rotation_6d: np.ndarray
     clip_start: np.ndarray
@@ -58,18 +54,7 @@ class PackedMotion:
     clip_style: np.ndarray
     clip_split: np.ndarray
     floor_shift: np.ndarray
-    primary_styles: tuple[str, ...]
-    mirror_styles: frozenset[str]
-    dataset: str
-    licence: str
-    credit: str
-    fingerprint: str
     skipped: tuple[tuple[str, str], ...] = ()
-
-    @property
-    def name(self) -> str:
-        """Name of the data set, as `Dataset.name`."""
-        return self.dataset
 
     @property
     def num_clips(self) -> int:
@@ -115,9 +100,7 @@ def pack(dataset: Dataset, *, progress: bool = True) -> PackedMotion:
         raise ValueError(f"data set {dataset.name!r} {what}")
     clips, skeletons, root_positions, rotations, floors = zip(*kept, strict=True)
     return PackedMotion(
-        skeleton=skeletons[0], styles=dataset.styles, primary_styles=dataset.primary_styles,
-        mirror_styles=dataset.mirror_styles, dataset=dataset.name, licence=dataset.licence, credit=dataset.credit,
-        fingerprint=dataset.fingerprint,
+        **{field.name: getattr(dataset, field.name) for field in fields(DataCard)}, skeleton=skeletons[0],
         root_position=np.concatenate(root_positions), rotation_6d=np.concatenate(rotations),
         clip_start=np.cumsum([0, *map(len, root_positions)]).astype(np.int32),
         clip_names=tuple(clip.name for clip in clips), clip_contents=tuple(clip.content for clip in clips),
@@ -134,6 +117,7 @@ def save_packed(path, packed: PackedMotion) -> Path:
     arrays = {name: parts.pop(name) for name, part in vars(packed).items() if isinstance(part, np.ndarray)}
     # Bones are text, too: in float64, which JAX's arrays are not.
     texts = parts | {"offsets": skeleton.offsets.tolist(), "mirror_styles": sorted(packed.mirror_styles)}
+    texts["dataset"] = texts.pop("name")  # as files of this format call it
     save_tree(path, arrays, {"kind": _KIND, **describe_skeleton(skeleton), **texts})
     return Path(path)
 
@@ -149,7 +133,7 @@ def load_packed(path) -> PackedMotion:
         check_kind(about, _KIND)
         parts = {name: np.asarray(array) for name, array in arrays.items()}
         parts |= {name: _tuples(value) for name, value in about.items()}
-        parts["mirror_styles"] = frozenset(parts["mirror_styles"])
+        parts |= {"name": about["dataset"], "mirror_styles": frozenset(about["mirror_styles"])}
         parts["skeleton"] = described_skeleton(about, about["offsets"])
         return PackedMotion(**{field.name: parts[field.name] for field in fields(PackedMotion)})
 

@@ -91,19 +91,17 @@ class Clip:
         return resample(motion, fps).replace(name=self.name), notes
 
 
-@dataclass(frozen=True)
-class Dataset:
-    """Clips with their styles and splits, and the terms under which they may be used.
+@dataclass(frozen=True, eq=False)
+class DataCard:
+    """What is known of a data set beside its motion, and the terms under which it may be used.
 
     Attributes:
       name: one of `NAMES`.
       licence, credit: terms of the motion data and the line that names its makers.
       fingerprint: SHA-256 (hex) of everything that decides what the clips hold.
       styles: labels in sorted order; the index is the one-hot position (paper section 3.3).
-      clips: all takes, sorted by name.
       primary_styles: classes that carry evaluation per style.
       mirror_styles: styles that stay themselves when left and right are swapped.
-      retarget: bring all clips to the skeleton of the first.
     """
 
     name: str
@@ -111,9 +109,20 @@ class Dataset:
     credit: str
     fingerprint: str
     styles: tuple[str, ...]
-    clips: tuple[Clip, ...]
     primary_styles: tuple[str, ...]
     mirror_styles: frozenset[str]
+
+
+@dataclass(frozen=True)
+class Dataset(DataCard):
+    """Clips with their styles and splits.
+
+    Attributes:
+      clips: all takes, sorted by name.
+      retarget: bring all clips to the skeleton of the first.
+    """
+
+    clips: tuple[Clip, ...]
     retarget: bool = False
 
 

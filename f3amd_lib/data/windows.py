@@ -141,7 +141,7 @@ def build_windows(
             paths.append(_path_variants(take.skeleton, world).astype(np.float32))
             offset += len(world)
     if not any(len(first) for first, _, _ in columns):
-        raise ValueError(f"data set {packed.dataset!r} has no {split} clip of at least {num_history + window} frames")
+        raise ValueError(f"data set {packed.name!r} has no {split} clip of at least {num_history + window} frames")
     starts_room_styles = (jnp.asarray(column, jnp.int32) for column in np.concatenate(columns, axis=1))
     one_hot = jnp.eye(len(names), dtype=jnp.float32)[jnp.array([names.index(style) for style in packed.styles])]
     frames, paths = jnp.asarray(np.concatenate(frames)), jnp.asarray(np.concatenate(paths, axis=1))

@@ -358,7 +358,7 @@ def _collect(
         usable &= np.diff(packed.clip_start) >= window
         if not usable.any():
             raise ValueError(
-                f"data set {packed.dataset!r}: style {style!r} has no {' or '.join(splits)} clip of at least {window} "
+                f"data set {packed.name!r}: style {style!r} has no {' or '.join(splits)} clip of at least {window} "
                 "frames; add clips, or leave the style out"
             )
         chosen += [(number, clip) for clip in np.flatnonzero(usable)]
@@ -459,9 +459,7 @@ def _asked_for(
     """Return the classes, which are the primary styles, the network's sizes and its training."""
     styles = tuple(packed.primary_styles)
     if len(styles) < 2:
-        raise ValueError(
-            f"data set {packed.dataset!r}: a style classifier needs at least two styles, got {len(styles)}"
-        )
+        raise ValueError(f"data set {packed.name!r}: a style classifier needs at least two styles, got {len(styles)}")
     return styles, ClassifierConfig(len(styles), **sizes), ClassifierTraining(num_steps, batch_size, seed)
 
 

@@ -37,7 +37,7 @@ def training_clips(packed: PackedMotion, style: str) -> np.ndarray:
     Raises:
       ValueError: for an unknown style.
     """
-    check_known(style, packed.styles, f"style of data set {packed.dataset!r}:")
+    check_known(style, packed.styles, f"style of data set {packed.name!r}:")
     of_style = np.asarray(packed.clip_style) == packed.styles.index(style)
     training = of_style & (np.asarray(packed.clip_split) == SPLITS.index("train"))
     return np.flatnonzero(training if training.any() else of_style)
@@ -180,7 +180,7 @@ def reference_clips(packed: PackedMotion, styles: Sequence[str], *, window: int,
         clips += fitting.tolist()
     if not clips:
         raise ValueError(
-            f"data set {packed.dataset!r} has no {split} clip of {', '.join(styles)} with more than {window + 1} frames"
+            f"data set {packed.name!r} has no {split} clip of {', '.join(styles)} with more than {window + 1} frames"
         )
     return clips
 

@@ -245,8 +245,8 @@ def bandai_text_motions(packed: PackedMotion) -> TextMotions:
     Raises:
       ValueError: for another data set.
     """
-    if packed.dataset != "bandai":
-        raise ValueError(f"captions are composed for data set 'bandai', not for {packed.dataset!r}")
+    if packed.name != "bandai":
+        raise ValueError(f"captions are composed for data set 'bandai', not for {packed.name!r}")
     styles = [plain_style(packed.styles[style]) for style in packed.clip_style]
     labels = {
         clip: (content, styles[clip]) for clip, content in enumerate(packed.clip_contents) if content in CAPTIONED
