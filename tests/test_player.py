@@ -250,7 +250,7 @@ def test_what_cannot_be_shown_is_refused_by_name():
     refused("40 frames at 60", player_page, Character(motion, path=RootPath(path.position, path.yaw, fps=60.0)))
     bad = np.array(path.position)
     bad[3, 1] = np.nan
-    refused(r"a target path must be \[T, 2\]", player_page, Character(motion, path=bad))
+    refused("target path is not finite at frame 3", player_page, Character(motion, path=bad))
 
 
 # -------------------------------------------------------------------------------------------- files

@@ -117,7 +117,8 @@ def path_condition(position, yaw):
       [..., T, 8]: displacement, then yaw in 6D.
     """
     xp = array_module(position, yaw)
-    return xp.concatenate([position, rotations.rotation_6d_from_yaw(yaw)], axis=-1)
+    facing = rotations.rotation_6d_from_matrix(rotations.matrix_from_yaw(yaw))
+    return xp.concatenate([position, facing], axis=-1)
 
 
 def bend_path(displacement, drift):

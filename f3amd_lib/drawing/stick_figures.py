@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from f3amd_lib.ground.arrays import finite_array
 from f3amd_lib.motion.anatomy import side_of
 from f3amd_lib.motion.skeleton import Motion, Skeleton, global_rotations
 
@@ -127,7 +128,4 @@ def body_lines(skeleton: Skeleton, points: np.ndarray) -> tuple[np.ndarray, list
 
 def path_on_ground(path) -> np.ndarray:
     """Accept a RootPath or an array [T, 2] of x and z."""
-    points = np.asarray(getattr(path, "position", path), dtype=np.float64)
-    if points.ndim != 2 or points.shape[1] != 2 or not np.all(np.isfinite(points)):
-        raise ValueError(f"a target path must be [T, 2] (x, z) and finite, got {points.shape}")
-    return points
+    return finite_array("target path", getattr(path, "position", path), ("frame", 2))

@@ -11,6 +11,7 @@ import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 from scipy.integrate import cumulative_trapezoid
 from scipy.ndimage import gaussian_filter1d
 from scipy.special import jn_zeros
@@ -273,11 +274,8 @@ def tangent_yaw(position: np.ndarray) -> np.ndarray:
     """
     velocity = np.gradient(position, axis=0)
     moving = np.linalg.norm(velocity, axis=-1) > 1e-4  # 3 mm/s at 30 fps
-    if not moving.any():
-        return np.zeros(len(position))
-    last = np.maximum.accumulate(np.where(moving, np.arange(len(position)), -1))
-    last = np.where(last < 0, np.argmax(moving), last)
-    return np.arctan2(velocity[last, 0], velocity[last, 1])
+    yaw = pd.Series(np.where(moving, np.arctan2(*velocity.T), np.nan))
+    return yaw.ffill().bfill().fillna(0.0).to_numpy()
 
 
 def path_from_motion(motion: Motion) -> RootPath:

@@ -69,18 +69,6 @@ def matrix_from_yaw(yaw):
     return xp.stack(rows, axis=-2)
 
 
-def rotation_6d_from_yaw(yaw):
-    """Return the 6D form of a yaw angle, the path's facing signal (paper section 3.3).
-
-    Args:
-      yaw: radians, [...].
-
-    Returns:
-      6D rotations, [..., 6].
-    """
-    return rotation_6d_from_matrix(matrix_from_yaw(yaw))
-
-
 def wrap_angle(angle):
     """Map angles to [-pi, pi), radians, any shape."""
     xp = array_module(angle)
