@@ -16,6 +16,7 @@ import matplotlib.style
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from PIL import Image
 
 from f3amd_lib.ground.files import named_file, read_toml, write_whole
@@ -114,7 +115,7 @@ def save_figure(figure: Figure, path) -> Path:
       ValueError: if the name does not end in .png.
     """
     path = named_file(path, ".png", "figures")
-    return write_whole(path, _png(figure, 110))
+    return write_whole(path, _png(figure, None))
 
 
 def show_figure(figure: Figure, *, dpi: int = 100, colors: int | None = None, full: str = ""):
@@ -152,15 +153,17 @@ def keep_figure(figure: Figure, results, name: str, colors: int = 64, data: str 
     if data:
         figure.supxlabel(f"data: {data}", x=0.995, ha="right", fontsize=7, color=PALETTE["grey"])
     file = save_figure(figure, Path(results) / "figures" / f"{name}.png")
+    figure.set_layout_engine("none")  # everything stays where it was just laid out
     return show_figure(figure, dpi=76, colors=colors, full=hashlib.sha256(file.read_bytes()).hexdigest())
 
 
-def _png(figure: Figure, dpi: int) -> bytes:
+def _png(figure: Figure, dpi: int | None) -> bytes:
     buffer = io.BytesIO()
     with plot_style():
         # Axes of a fixed aspect have their final size only after a first layout, and titles and
         # labels are kept inside the picture only by a second one.
-        if any(axis.get_aspect() != "auto" for axis in figure.axes):
+        laid_out = isinstance(figure.get_layout_engine(), ConstrainedLayoutEngine)
+        if laid_out and any(axis.get_aspect() != "auto" for axis in figure.axes):
             figure.draw_without_rendering()
         figure.savefig(buffer, format="png", dpi=dpi, metadata={"Software": None})
     return buffer.getvalue()
