@@ -14,6 +14,10 @@ VENV := $(or $(F3AMD_VENV),.venv)
 PYTHON := $(VENV)/bin/python
 INSTALLED := $(VENV)/installed
 NOTEBOOKS := $(sort $(wildcard notebooks/*.ipynb notebooks/course/*.ipynb notebooks/standalone/*.ipynb))
+# For `make test-slow`: they take 20 to 90 CPU seconds each, where 10 are usual, since they train, search, time or compile whole
+# networks, all by code that has tests of its own. The rest is to stay below 300 in all.
+SLOW_NOTEBOOKS := $(sort $(foreach name,04 06 07 10 11 12 14 16 17 20 21 22 course/06 course/09 course/10,\
+  $(wildcard notebooks/$(name)_*.ipynb)))
 
 export F3AMD_PYTHON
 
@@ -56,6 +60,9 @@ NO_NOTEBOOKS := -p no:nbval
 SIDE_BY_SIDE := --numprocesses auto --maxprocesses 4 --dist loadfile
 # Test files with a marker: to collect the others as well takes each process ten seconds.
 MARKED = $(shell grep -l 'mark\.$(1)\b' tests/test_*.py) -m $(1)
+# Notebooks against their committed outputs.
+COMPARED = $(PYTEST) $(1) $(SIDE_BY_SIDE) --no-loadscope-reorder --nbval-lax --nbval-current-env \
+  --nbval-cell-timeout=600 $(PYTEST_OPTIONS)
 
 measure: $(INSTALLED) ## Measure what notebooks only draw (long; goes on where it stopped)
 	F3AMD_RESULTS_DIR=$${F3AMD_RESULTS_DIR:-paper_figures} \
@@ -72,14 +79,14 @@ onnx-tools: $(VENV)/extra-onnx ## Add jax2onnx and ONNX Runtime to .venv (about 
 
 sweep-tools: $(VENV)/extra-sweep ## Add Dask distributed to .venv, for f3amd sweep (about 30 MB)
 
-test: lint ## Lint, run the tests but the slow ones, check the notebooks' committed outputs
+test: lint ## Lint, run the tests but the slow ones, check committed outputs of most notebooks
 	$(PYTEST) $(NO_NOTEBOOKS) tests $(SIDE_BY_SIDE) -m "not slow and not long" $(PYTEST_OPTIONS)
-	$(if $(NOTEBOOKS),$(PYTEST) $(NOTEBOOKS) $(SIDE_BY_SIDE) --no-loadscope-reorder \
-	  --nbval-lax --nbval-current-env --nbval-cell-timeout=600 $(PYTEST_OPTIONS))
+	$(call COMPARED,$(filter-out $(SLOW_NOTEBOOKS),$(NOTEBOOKS)))
 
 # Every preset, whole trainings, several processes: what would make `make test` long.
-test-slow: $(INSTALLED) ## Run the slow tests that `make test` leaves out
+test-slow: $(INSTALLED) ## Run the slow tests and notebooks that `make test` leaves out
 	$(PYTEST) $(NO_NOTEBOOKS) $(SIDE_BY_SIDE) $(call MARKED,slow) $(PYTEST_OPTIONS)
+	$(call COMPARED,$(SLOW_NOTEBOOKS))
 
 test-long: $(INSTALLED) ## Rehearse each command of the ledger at smoke size, and the notebooks with other seeds
 	$(PYTEST) $(NO_NOTEBOOKS) $(SIDE_BY_SIDE) $(call MARKED,long) $(PYTEST_OPTIONS)
