@@ -192,20 +192,38 @@ def test_a_rounded_frame_time_of_60_fps_still_halves():
     np.testing.assert_array_equal(half.rotations, motion.rotations[::2])
 
 
+@pytest.mark.parametrize("smooth", [False, True])
 @pytest.mark.parametrize("fps", [50.0, 24.0])
-def test_other_ratios_interpolate(fps):
+def test_other_ratios_interpolate(fps, smooth):
     # A steady walk with a steady turn: the answer is known at every time.
     frames = int(2 * fps) + 1
     time = np.arange(frames) / fps
     root = np.stack([1.5 * time, np.ones(frames), -0.5 * time], axis=-1)
     local = np.broadcast_to(np.eye(3), (frames, 5, 3, 3)).copy()
     local[:, 0] = rotations.matrix_from_yaw(2.0 * time)
-    out = skeleton.resample(Motion(legs(), root, local, fps=fps), 30.0)
+    out = skeleton.resample(Motion(legs(), root, local, fps=fps), 30.0, smooth=smooth)
     assert (out.num_frames, out.fps) == (61, 30.0)
     time = np.arange(61) / 30.0
     np.testing.assert_allclose(out.root_position[:, 0], 1.5 * time, atol=1e-9)
     np.testing.assert_allclose(out.root_position[:, 2], -0.5 * time, atol=1e-9)
     np.testing.assert_allclose(out.rotations[:, 0], rotations.matrix_from_yaw(2.0 * time), atol=1e-9)
+
+
+def test_splines_bend_with_the_motion_where_lines_cut_its_corners():
+    time = np.arange(25) / 24.0
+    swing = lambda time: np.stack([np.zeros_like(time), np.sin(6 * time), time], axis=-1)
+    turned = rotations.matrix_from_yaw(np.sin(6 * time))[:, None] * np.ones((1, 5, 1, 1))
+    motion, asked = Motion(legs(), swing(time), turned, fps=24.0), np.arange(31) / 30.0
+    off = {}
+    for smooth in (False, True):
+        out = skeleton.resample(motion, 30.0, smooth=smooth)
+        off[smooth] = [
+            np.abs(out.root_position - swing(asked)).max(),
+            np.abs(out.rotations[:, 0] - rotations.matrix_from_yaw(np.sin(6 * asked))).max(),
+        ]
+    assert min(off[False]) > 3e-3 and max(off[True]) < 1e-3
+    still = motion.slice(0, 1)
+    np.testing.assert_allclose(skeleton.resample(still, 30.0, smooth=True).positions, still.positions, atol=1e-12)
 
 
 # ------------------------------------------------------------------- what cannot be, is said

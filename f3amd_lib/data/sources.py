@@ -88,7 +88,7 @@ class Clip:
         motion, notes = self.loader(), []
         if self.person is not None:
             motion, notes = as_person(motion, **self.person)
-        return resample(motion, fps).replace(name=self.name), notes
+        return resample(motion, fps, smooth=True).replace(name=self.name), notes
 
 
 @dataclass(frozen=True, eq=False)

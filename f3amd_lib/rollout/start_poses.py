@@ -72,7 +72,7 @@ def start_history(trained: TrainedModel, motion: Motion, path: RootPath) -> tupl
     Raises:
       ValueError: for a motion shorter than the history, or a skeleton whose joints we cannot name.
     """
-    motion, frames = resample(motion, 30.0), trained.config.num_history
+    motion, frames = resample(motion, 30.0, smooth=True), trained.config.num_history
     if motion.num_frames < frames:
         needed = f"{frames}, {frames / 30.0:.1f} s"
         raise ValueError(f"{motion.name}: {motion.num_frames} frames at 30 fps; a start needs {needed}")
