@@ -43,6 +43,13 @@ def known(look: Callable, *arguments, **named):
         return None
 
 
+def _table_or_gap(load: Callable, name: str):
+    try:
+        return load(name)
+    except NotMeasured as gap:
+        return gap
+
+
 # ---------------------------------------------------------------------------- figures and intervals
 
 
@@ -139,10 +146,15 @@ class Evidence:
     def __init__(self, load: Callable, framework: str = "jax"):
         """Args: `load(name)` returns (table, record, path) or raises NotMeasured."""
         self.framework, self.printed = framework, framework != "jax"
-        self._load = functools.cache(load)
-        # A ledger asks for thousands of figures, by few values of a column.
-        self._holding = functools.cache(lambda name, column, value: (load(name)[0][column] == value).to_numpy())
+        # A ledger asks for thousands of figures, of few tables and by few values of a column.
+        self._read = functools.cache(functools.partial(_table_or_gap, load))
+        self._holding = functools.cache(lambda name, column, value: (self._load(name)[0][column] == value).to_numpy())
         self.forget()
+
+    def _load(self, name: str):
+        if isinstance(read := self._read(name), NotMeasured):
+            raise read.with_traceback(None)
+        return read
 
     def forget(self) -> None:
         """Forget what was looked up; whoever wants to know what a rule looks up calls this first."""
@@ -195,7 +207,9 @@ class Evidence:
         """
         found = self.rows(name, **row)
         if value in found and len(found := found[found[value].notna()]):
-            return Figure.of(*found[["value", "low", "high"] if value == "value" else [value]].iloc[0])
+            return Figure.of(
+                *(found[one].iat[0] for one in (("value", "low", "high") if value == "value" else (value,)))
+            )
         what = "" if value == "value" else f"{value} of "
         raise NotMeasured(f"{self.called(name)} no {what}{_row_text(row)}")
 
