@@ -177,13 +177,9 @@ def network_of(config: NetworkConfig) -> nnx.Module:
 def stirred(network, seed: int = 0, scale: float = 0.2):
     """The network with random weights in place of its zeros."""
     graph, state = nnx.split(network)
-    return nnx.merge(graph, _stirred(state, seed, scale))
-
-
-@jax.jit
-def _stirred(state, seed, scale):
-    keys = iter(jax.random.split(jax.random.key(seed), len(jax.tree.leaves(state))))
-    return jax.tree.map(lambda leaf: leaf + scale * jax.random.normal(next(keys), leaf.shape), state)
+    rng = np.random.default_rng(seed)  # JAX's would be compiled for each form of network
+    moved = lambda leaf: jnp.asarray(np.asarray(leaf) + scale * rng.standard_normal(leaf.shape), leaf.dtype)
+    return nnx.merge(graph, jax.tree.map(moved, state))
 
 
 def evaluate(network, x_noisy, sigma, condition):

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from builders import draw
 from compiled import Compiled
 from flax import nnx
 
@@ -33,7 +34,7 @@ def network():
 
 def test_the_halving_convolution_is_one_of_four_taps():
     layer = HalvingConvolution(3, 2, rngs=nnx.Rngs(0))
-    z = jax.random.normal(jax.random.key(1), (2, 8, 3))
+    z = draw(2, 8, 3, seed=1)
     kernel = layer.taps.kernel[...].reshape(4, 3, 2)
     expected = jax.lax.conv_general_dilated(z, kernel, (2,), [(1, 1)], dimension_numbers=("NWC", "WIO", "NWC"))
     assert np.allclose(layer(z), expected + layer.taps.bias[...], atol=1e-5)
@@ -41,14 +42,14 @@ def test_the_halving_convolution_is_one_of_four_taps():
 
 @pytest.mark.parametrize("length", [8, 10, 11])
 def test_padding_changes_no_motion(network, length):
-    motion = jax.random.normal(jax.random.key(0), (1, length, 5))
+    motion = draw(1, length, 5, seed=0)
     lengths = jnp.array([length])
     answers = [network.embed_motion(jnp.pad(motion, ((0, 0), (0, to - length), (0, 0))), lengths) for to in (12, 40)]
     assert np.allclose(answers[0], answers[1], atol=1e-6)
 
 
 def test_padding_changes_no_text_and_order_does(network):
-    tokens = jax.random.normal(jax.random.key(0), (1, 4, 6))
+    tokens = draw(1, 4, 6, seed=0)
     answer = network.embed_text(tokens, jnp.ones((1, 4), bool))
     longer = jnp.pad(tokens, ((0, 0), (0, 5), (0, 0)), constant_values=7.0)
     assert np.allclose(network.embed_text(longer, jnp.arange(9)[None] < 4), answer, atol=1e-6)
@@ -96,12 +97,12 @@ def test_each_layer_is_pytorchs_own():
     """Random weights, biases too; a norm's input of little deviation shows its epsilon."""
     config = dataclasses.replace(SMALL, released=True, tag_width=3)
     graph, params = nnx.split(TextMotionNetwork(config, rngs=nnx.Rngs(0)))
-    keys = iter(jax.random.split(jax.random.key(1), 99))
-    params = jax.tree.map(lambda leaf: 0.3 * jax.random.normal(next(keys), leaf.shape), params)
+    rng = np.random.default_rng(1)
+    params = jax.tree.map(lambda leaf: jnp.asarray(0.3 * rng.standard_normal(leaf.shape), leaf.dtype), params)
     network = nnx.merge(graph, params)
     for part in (network.motion, network.text):
         part.middle.kernel[...], part.middle.bias[...] = 1e-3 * part.middle.kernel[...], 1e-3 * part.middle.bias[...]
-    motion, lengths = np.array(jax.random.normal(jax.random.key(2), (2, 24, 5))), (12, 19)
+    motion, lengths = np.array(draw(2, 24, 5, seed=2)), (12, 19)
     motion[0, 12:], motion[1, 19:] = 0.0, 0.0
     made = network.embed_motion(jnp.asarray(motion), jnp.array(lengths))
     for seen, length, answer in zip(motion, lengths, made, strict=True):
@@ -113,7 +114,7 @@ def test_each_layer_is_pytorchs_own():
         wanted = both_ways(network.motion, tokens)
         np.testing.assert_allclose(told, wanted, atol=1e-4)
         np.testing.assert_allclose(answer, wanted, atol=1e-4)
-    words, tags = (np.array(jax.random.normal(jax.random.key(k), (2, 6, width))) for k, width in ((3, 6), (4, 3)))
+    words, tags = (np.array(draw(2, 6, width, seed=k)) for k, width in ((3, 6), (4, 3)))
     mask = np.arange(6) < np.array([[4], [6]])
     for given in ((words, mask), (words, mask, tags)):
         tagged = words + linear(network.tags, tags) if len(given) == 3 else words
@@ -122,7 +123,7 @@ def test_each_layer_is_pytorchs_own():
 
 
 def test_time_has_a_direction(network):
-    motion = jax.random.normal(jax.random.key(0), (1, 12, 5))
+    motion = draw(1, 12, 5, seed=0)
     there, back = (network.embed_motion(m, jnp.array([12])) for m in (motion, motion[:, ::-1]))
     assert not np.allclose(there, back, atol=1e-3)
 

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from builders import draw
 from compiled import Compiled
 from flax import nnx
 
@@ -43,7 +44,7 @@ def coders():
 
 
 def normal(seed, *shape):
-    return jax.random.normal(jax.random.key(seed), shape)
+    return draw(*shape, seed=seed)
 
 
 def numbers(module):
