@@ -37,6 +37,8 @@ from safetensors.numpy import load_file
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this tree's library, whatever is installed
 
+from f3amd_notebooks.beside_printed import beside_printed
+
 from f3amd_companion.ledger.claims import judge_claims, ledger, ledger_markdown
 from f3amd_companion.ledger.equation_map import equation_map
 from f3amd_companion.ledger.model_cards import card_of, committed_quality
@@ -74,7 +76,6 @@ from f3amd_lib.motion.root_paths import named_path
 from f3amd_lib.motion.skeleton import Motion, resample
 from f3amd_lib.motion.synthetic import STYLES, synthesize
 from f3amd_lib.networks.presets import PRESETS, Preset, build_config, find_family, find_preset, of_paper, table
-from f3amd_lib.papers.printed import beside_printed
 from f3amd_lib.papers.readings import readings_table
 from f3amd_lib.rollout.rollout import MotionGenerator
 from f3amd_lib.text.data.text_encoders import embed_captions, load_text_encoder

@@ -2,17 +2,17 @@
 
 import pandas as pd
 import pytest
+from f3amd_notebooks import beside_printed as beside
+from f3amd_notebooks.beside_printed import beside_printed, judge_note
 
 from f3amd_lib.ground import stored
-from f3amd_lib.papers import printed
-from f3amd_lib.papers.printed import beside_printed, judge_note
 
 
 @pytest.fixture
 def committed(monkeypatch):
     """Tables that are committed, by name: (table, record); a test puts in what it wants."""
     tables = {}
-    for module in (stored, printed):
+    for module in (stored, beside):
         monkeypatch.setattr(module, "committed_table", lambda dataset, name: tables.get(name))
     return tables
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from builders import SKELETON, refused, wandering_motion
+from f3amd_notebooks import walk_tables
 
 from f3amd_lib.ground.profiles import SHOWN_STYLES
 from f3amd_lib.measures import walking
@@ -87,7 +88,7 @@ def test_a_kick_at_the_seams_is_seen(walk):
 
 
 def failed(walk, sources, **floors):
-    table = walking.check_walks({"Neutral": walk}, sources, WINDOW, floors)
+    table = walk_tables.check_walks({"Neutral": walk}, sources, WINDOW, floors)
     assert len(table) == len(walking.CHECKS)
     return set(table.loc[~table["holds"], "check"])
 
@@ -115,9 +116,9 @@ def test_the_source_of_every_shown_style_walks(style):
     path = named_path("figure-eight", 12 * WINDOW, speed=style_parameters(style).speed)
     along = walk_along(style, path)
     free = synthesize(style, seconds=12.0, seed=5)
-    table = walking.check_walks({style: along}, {style: along}, WINDOW)
+    table = walk_tables.check_walks({style: along}, {style: along}, WINDOW)
     assert table["holds"].all()
-    refused("no source motion of style", walking.check_walks, {style: along}, {"another": along}, WINDOW)
+    refused("no source motion of style", walk_tables.check_walks, {style: along}, {"another": along}, WINDOW)
     rates = [walking.stepping_rate(m.positions, m.skeleton) for m in (along, free)]
     assert rates[0] == pytest.approx(rates[1], rel=0.35)  # free clips stop and turn
 

@@ -7,7 +7,7 @@ has them: the IRD of a real walker is a step, not zero, and "a walking person" i
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
@@ -21,10 +21,10 @@ from f3amd_lib.measures.walking import walking_measures
 from f3amd_lib.motion.root_paths import RootPath, path_from_motion
 from f3amd_lib.motion.rotations import wrap_angle
 from f3amd_lib.motion.skeleton import Motion
-from f3amd_lib.rollout.blending import blend_rollout
 from f3amd_lib.rollout.generated import Rollout
 
-_STANDING = 0.1  # m/s
+STANDING = 0.1
+"""Metres a second up to which somebody stands."""
 
 _SPEEDS = (0.4, 1.6)
 """Mean speeds of `reference_clips` in units of `style_pace`: those between which `named_path("complex", speed=pace)`
@@ -66,8 +66,8 @@ def style_pace(packed: PackedMotion, style: str) -> float:
       ValueError: for an unknown style.
     """
     speeds = np.concatenate([_speeds(packed, clip) for clip in training_clips(packed, style)])
-    moving = speeds[speeds > _STANDING]
-    return float(np.median(moving)) if len(moving) else _STANDING
+    moving = speeds[speeds > STANDING]
+    return float(np.median(moving)) if len(moving) else STANDING
 
 
 def style_floor(packed: PackedMotion, style: str) -> float:
@@ -92,7 +92,7 @@ def sideways_share(path: RootPath) -> float:
       path: of a target or, from `path_from_motion`, of a clip.
     """
     step = np.diff(path.position, axis=0)
-    moving = np.linalg.norm(step, axis=-1) * path.fps > _STANDING
+    moving = np.linalg.norm(step, axis=-1) * path.fps > STANDING
     if not moving.any():
         return 0.0
     off = wrap_angle(np.arctan2(step[:, 0], step[:, 1]) - path.yaw[:-1])
@@ -194,35 +194,6 @@ def follow_longest(
     return follow_clip(packed, longest, num_history=num_history, num_frames=num_frames)
 
 
-def path_statistics(paths: Iterable[RootPath]) -> dict:
-    """Describe paths, or the tracks of real clips, by how they move and turn.
-
-    Args:
-      paths: any number of them.
-
-    Returns:
-      speed_m_s and its 5th and 95th percentiles, turn_deg_s (mean turn of the direction of travel,
-      counted over a second, so that the sway of a stride is not) and its 95th percentile,
-      sideways_share, standing_share; over all moving frames of all paths.
-    """
-    speeds, turns, shares = [], [], []
-    for path in paths:
-        speeds.append(np.linalg.norm(np.diff(path.position, axis=0) * path.fps, axis=-1))
-        shares.append(sideways_share(path))
-        span = round(path.fps)
-        legs = path.position[span:] - path.position[:-span]
-        moved = np.linalg.norm(legs, axis=-1) > _STANDING
-        heading = np.rad2deg(np.unwrap(np.arctan2(legs[:, 0], legs[:, 1])))
-        turns.append(np.abs(heading[span:] - heading[:-span])[moved[span:] & moved[:-span]])
-    sideways = np.average(shares, weights=[len(speed) for speed in speeds])
-    speeds, turns = np.concatenate(speeds), np.concatenate(turns)
-    moving = speeds[speeds > _STANDING]
-    figures = {"speed_m_s": moving.mean(), "speed_p5": np.percentile(moving, 5), "speed_p95": np.percentile(moving, 95)}
-    figures |= {"turn_deg_s": turns.mean(), "turn_p95": np.percentile(turns, 95)}
-    figures |= {"sideways_share": sideways, "standing_share": 1.0 - len(moving) / len(speeds)}
-    return {name: float(value) for name, value in figures.items()}
-
-
 # ------------------------------------------------------------------- measured alike: clips and rollouts
 
 
@@ -287,24 +258,3 @@ def by_round(rollout: Rollout) -> pd.DataFrame:
     gaps = np.stack(gaps)
     table = {"round": np.arange(1, rounds + 1), "gap_m": gaps.mean(axis=0), "worst_gap_m": gaps.max(axis=0)}
     return pd.DataFrame(table | {"acceleration_cm": np.mean(accelerations, axis=0)})
-
-
-def blending_table(rollout: Rollout, floor_shift, blend_frames: Sequence[int]) -> pd.DataFrame:
-    """Measure a rollout as it is and blended over several numbers of frames.
-
-    Args:
-      rollout: as the network made it.
-      floor_shift: as for `measure_rollout`, metres.
-      blend_frames: numbers of frames; 0 is the rollout itself.
-
-    Returns:
-      A row each: blend_frames, then the means over characters of IRD and its excess (cm), step
-      between any two frames (cm), joint acceleration (cm/frame^2), foot sliding and trajectory
-      error (m), under their keys (`registry.Metric.key`).
-    """
-    keys = "ird_cm ird_excess_cm inter_frame_step_cm joint_acceleration_cm foot_sliding trajectory_error_m".split()
-    rows = []
-    for count in blend_frames:
-        measured = measure_rollout(blend_rollout(rollout, count), floor_shift)
-        rows.append({"blend_frames": count} | {key: np.nanmean(measured[key]) for key in keys})
-    return pd.DataFrame(rows)

@@ -7,16 +7,12 @@ floor at y = `floor`. All of this is ours: the paper has the foot-sliding ratio 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from itertools import groupby
 
 import numpy as np
-import pandas as pd
 from scipy.ndimage import uniform_filter1d
 
-from f3amd_lib.ground.names import row_label
 from f3amd_lib.measures.metrics import foot_sliding, joint_acceleration
-from f3amd_lib.measures.registry import METRICS
 from f3amd_lib.motion.rotations import matrix_from_yaw
 from f3amd_lib.motion.skeleton import Motion, Skeleton, contact_labels, facing_yaw
 
@@ -161,39 +157,7 @@ def bone_swing(positions, skeleton: Skeleton):
     return np.rad2deg(np.sqrt(np.maximum(2.0 * (1.0 - together), 0.0))).mean(axis=-1)
 
 
-def steps_by_frame_in_window(positions, window: int) -> pd.DataFrame:
-    """Average joint step and acceleration by the place of the newest frame in its window.
-
-    Place 0 is the seam: its step is `metrics.ird`, its acceleration `metrics.ird_excess`. Motion
-    that does not know of windows gives level lines.
-
-    Args:
-      positions: [..., T, J, 3], metres, at 30 fps; window k starts at frame k * window.
-      window: frames.
-
-    Returns:
-      Columns place, step_cm, acceleration_cm; `window` rows.
-
-    Raises:
-      ValueError: for fewer than window + 2 frames, which would leave a place without a figure.
-    """
-    positions = np.asarray(positions, np.float64)
-    if positions.shape[-3] < window + 2:
-        raise ValueError(f"{positions.shape[-3]} frames do not show every place of a window; at least {window + 2} do")
-    columns = {"place": np.arange(window)}
-    for order, name in ((1, "step_cm"), (2, "acceleration_cm")):
-        change = np.linalg.norm(np.diff(positions, n=order, axis=-3), axis=-1).mean(axis=-1)
-        change = 100.0 * change.reshape(-1, change.shape[-1]).mean(axis=0)
-        place = np.arange(order, positions.shape[-3]) % window
-        columns[name] = np.bincount(place, change) / np.bincount(place)
-    return pd.DataFrame(columns)
-
-
 # ----------------------------------------------------------------------------- held against real motion
-
-FACTORS = {"joint_acceleration": 1.5, "foot_alternation": 1.5, "bone_swing": 1.5, "contact_share": 2.0}
-"""Metric -> the factor within which a generated walker must come to the real one, above and below,
-to count as a walking person (our choice)."""
 
 
 def walking_measures(positions, skeleton: Skeleton, *, floor_shift=None) -> dict:
@@ -205,7 +169,7 @@ def walking_measures(positions, skeleton: Skeleton, *, floor_shift=None) -> dict
       floor_shift: see `metrics.foot_sliding`.
 
     Returns:
-      The keys of `FACTORS` in dicts of figures (`registry.Metric.key`) -> one number a character.
+      Keys of dicts of figures (`registry.Metric.key`) -> one number a character.
     """
     return {
         "joint_acceleration_cm": joint_acceleration(positions),
@@ -213,29 +177,6 @@ def walking_measures(positions, skeleton: Skeleton, *, floor_shift=None) -> dict
         "bone_swing_deg": bone_swing(positions, skeleton),
         "contact_share": foot_sliding(positions, skeleton, floor_shift)[1],
     }
-
-
-def walking_checks(real: Mapping, measured: Mapping[tuple[str, int], Mapping]) -> pd.DataFrame:
-    """Compare walkers with real ones, measure by measure.
-
-    Args:
-      real: keys of `walking_measures` -> figures of real clips.
-      measured: (model, steps) -> the same of generated motion.
-
-    Returns:
-      One row per system and measure: label, measure, unit, real and value (means over characters),
-      ratio, factor, within (whether the ratio lies between 1 / factor and factor).
-    """
-    rows = []
-    for (model, steps), values in measured.items():
-        for name, factor in FACTORS.items():
-            metric = METRICS[name]
-            wanted, value = (float(np.mean(np.asarray(side[metric.key]))) for side in (real, values))
-            ratio = value / wanted if wanted > 0 else float("nan")
-            row = {"label": row_label(model, steps), "measure": metric.heading, "unit": metric.unit}
-            row |= {"real": wanted, "value": value, "ratio": ratio, "factor": factor}
-            rows.append(row | {"within": bool(1.0 / factor <= ratio <= factor)})
-    return pd.DataFrame(rows)
 
 
 CHECKS = {
@@ -269,30 +210,3 @@ def walking_figures(motion: Motion, window: int, floor: float = 0.0) -> dict[str
         "seam_kick": seam_kick(positions, window),
     }
     return {name: float(value) for name, value in figures.items()}
-
-
-def check_walks(
-    walks: Mapping[str, Motion], sources: Mapping[str, Motion], window: int, floors: Mapping = {}
-) -> pd.DataFrame:
-    """Hold generated walks against the motion that they were learnt from, style by style.
-
-    Args:
-      walks: style -> generated motion.
-      sources: style -> motion of the source, best along the same path.
-      window: frames.
-      floors: style -> height of the floor, metres; 0 where a style is not named.
-
-    Returns:
-      One row per style and check: style, check, unit, source, value, wanted, holds.
-    """
-    rows = []
-    for style, motion in walks.items():
-        if style not in sources:
-            raise ValueError(f"no source motion of style {style!r} to hold the walk against")
-        floor = float(floors.get(style, 0.0))
-        figures, source = walking_figures(motion, window, floor), walking_figures(sources[style], window, floor)
-        for name, (wanted, holds) in CHECKS.items():
-            row = {"style": style, "check": METRICS[name].heading, "unit": METRICS[name].shown_unit}
-            row |= {"source": source[name], "value": figures[name], "wanted": wanted}
-            rows.append(row | {"holds": bool(holds(figures[name], source[name]))})
-    return pd.DataFrame(rows)

@@ -1,5 +1,4 @@
-"""What the papers print, in the form of our records: tidy tables of `SCHEMAS`, models by their presets' names; and
-both side by side, in columns that say whose they are."""
+"""What the papers print, in the form of our records: tidy tables of `SCHEMAS`, models by their presets' names."""
 
 from __future__ import annotations
 
@@ -11,10 +10,7 @@ import pandas as pd
 
 from f3amd_lib.ground.files import read_toml
 from f3amd_lib.ground.names import nearest_hint
-from f3amd_lib.ground.papers import find_entry, has_paper_file, load_paper_file, load_paper_table, paper_folders
-from f3amd_lib.ground.stored import committed_table, measured_table
-from f3amd_lib.ground.tables import ARROWS
-from f3amd_lib.measures.registry import METRICS
+from f3amd_lib.ground.papers import find_entry, load_paper_file, load_paper_table
 from f3amd_lib.measures.walking import CHECKS
 from f3amd_lib.networks import presets
 
@@ -137,58 +133,3 @@ def printed_tables(paper: str = "f3amd") -> dict[str, pd.DataFrame]:
         rows = rows.drop_duplicates([*SCHEMAS[name], "value"])
         tables[name] = checked_table(name, rows, f"the paper's {name}", others)
     return tables
-
-
-# --------------------------------------------------------------------- ours beside it, for notebooks
-
-
-def beside_printed(paper: str, name: str, metrics: Sequence[str]) -> tuple[pd.DataFrame, str]:
-    """Return a paper's table with ours of Bandai beside it, and a sentence that says where ours comes from.
-
-    Args:
-      paper: a folder of `papers/`.
-      name: of the table of ours, such as "text_tableA5".
-      metrics: which of its metrics, by our names.
-
-    Returns:
-      (a row for each row of either, sentence). Columns are those that tell rows apart, then "paper: FID" and so on,
-      with 95 % intervals, then "ours: FID", and "our network". Without a record the paper's stand alone, and the
-      sentence says how to measure ours.
-    """
-    keys = [key for key in SCHEMAS[name] if key != "metric"]
-    stored, sentence = measured_table("bandai", name, name)
-    parts, columns = {"paper": printed_tables(paper)[name]}, []
-    if stored is not None:
-        parts["ours"] = stored
-        sentence = f"{sentence} {judge_note(name)}".strip()
-    for whose, part in parts.items():
-        for metric in metrics:
-            rows = part[part["metric"] == metric].set_index(keys)
-            heading = METRICS[metric].title + ARROWS.get(METRICS[metric].better, "")
-            columns.append(rows.apply(_with_interval, axis=1).rename(f"{whose}: {heading}"))
-    if stored is not None:
-        columns.append(stored.drop_duplicates(keys).set_index(keys)["trained"].rename("our network"))
-    return pd.concat(columns, axis=1).fillna("–").reset_index(), sentence
-
-
-def _with_interval(row) -> str:
-    figures = [f"{row[bound]:.3g}" for bound in ("value", "low", "high")]
-    return figures[0] if pd.isna(row["low"]) else "{} ({} to {})".format(*figures)
-
-
-def judge_note(name: str) -> str:
-    """Say which other tables of text to motion were looked at by another judge than a committed one, "" if none was.
-
-    Judges of one recipe differ from training to training, so that their figures are on scales of their own.
-    """
-    papers = [paper for paper in paper_folders() if has_paper_file("experiments", paper)]
-    names = [other for paper in papers for other in load_paper_file("experiments", paper) if other != "settings"]
-    tables = {other: committed_table("bandai", other) for other in ("text_judge", *names)}
-    judges = {other: found[1]["judge_weights"] for other, found in tables.items() if found}
-    others = [f"`{other}`" for other, judge in judges.items() if judge != judges[name]]
-    if not others:
-        return ""
-    return (
-        f"The judge of `{name}` (weights {judges[name]}) is another than that of {', '.join(others)}: it was "
-        "trained anew. Compare FID, R-precision and their like within one judge's tables alone."
-    )

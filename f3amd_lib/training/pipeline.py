@@ -336,19 +336,6 @@ def shown_model(prepared: PreparedData, profile: Profile, *, progress: bool = Tr
     return trained, origin
 
 
-def shipped_history(profile: Profile, preset: str) -> pd.DataFrame:
-    """Return the losses of a model's training: of the shipped weights, or of a run of this profile.
-
-    Raises:
-      ValueError: if neither left any.
-    """
-    for folder in (PRETRAINED_DIR / profile.dataset, None):
-        history = model_files(profile, preset, folder=folder).history
-        if history.exists():
-            return read_table(history)[0]
-    raise ValueError(f"no losses of {preset} on {profile.dataset!r} are kept: train it first")
-
-
 def finished_model(prepared: PreparedData, profile: Profile, preset: str, files: ModelFiles) -> TrainedModel | None:
     """Return the model that a run by the profile's recipe left, None if it left none yet.
 
