@@ -4,8 +4,6 @@ A denoiser of `diffusion.samplers` gives a clean estimate; a network gives x0, e
 alpha x0 + sigma eps itself and a time. On the straight path a DDIM step is Euler's step of the flow.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import jax.numpy as jnp

@@ -5,8 +5,6 @@ stays a mixture, so its density, score, posterior mean and, in one dimension, th
 sample have closed forms.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -4,8 +4,6 @@ Wrappers take callables of (x_noisy, sigma), the variance-exploding state, and r
 describe one and the same walk: with an exact network every kind of prediction gives the same samples.
 """
 
-from __future__ import annotations
-
 import jax.numpy as jnp
 
 from f3amd_lib.diffusion.samplers import Denoiser

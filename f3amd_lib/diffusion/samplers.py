@@ -15,8 +15,6 @@ noise, does not. That third walk is here as well, to be studied (`ddim_step_lite
 written for the variance-exploding state, in which its update has no alpha_bar at all.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple

@@ -7,8 +7,6 @@ of signal power in the variance-preserving form of the same state (Appendix F), 
 one line with three labels. Grids are worked out in float64 with numpy.
 """
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field

@@ -5,8 +5,6 @@ a strength in [0, 1]: 0 gives the motion back, 1 is the recipe of our tables, an
 breaks it in part, so that a distance can be asked whether it orders them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

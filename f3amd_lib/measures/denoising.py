@@ -6,8 +6,6 @@ seed. It may still change its answer with the noise level that it is told, so th
 with the number of steps. These functions tell the two apart.
 """
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

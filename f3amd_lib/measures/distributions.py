@@ -9,8 +9,6 @@ sides are the caller's to see to (`draw_per_style`); `earth_movers_distance` ins
 All arithmetic is float64 numpy.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

@@ -13,8 +13,6 @@ A figure whose denominator vanishes (a root that does not move or accelerate) is
 for that character, and no reason to lose the others. Average with `numpy.nanmean`, and count.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from f3amd_lib.motion.root_paths import RootPath

@@ -15,13 +15,11 @@ FID, EMD and coverage see posture and style through one classifier. They say lit
 somebody walks or glides: read them beside changes of the planted foot, acceleration and contact.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 import pandas as pd
@@ -144,7 +142,7 @@ class ClassifiedWindows(NamedTuple):
     style: np.ndarray
     source: np.ndarray
 
-    def of(self, sources: Iterable[int]) -> ClassifiedWindows:
+    def of(self, sources: Iterable[int]) -> Self:
         """Return the windows of some of the motions, motion by motion in that order."""
         order = np.concatenate([np.flatnonzero(self.source == source) for source in sources])
         return ClassifiedWindows(*(part[order] for part in self))

@@ -5,8 +5,6 @@ measured on real held-out clips too, in the same way and as if they had window s
 has them: the IRD of a real walker is a step, not zero, and "a walking person" is a set of numbers.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

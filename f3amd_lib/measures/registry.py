@@ -1,7 +1,5 @@
 """The registry of metrics: names, units, which way is better, headings and definitions."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -5,8 +5,6 @@ character. A toe is the joint that `Skeleton.toes` names; its height is that of 
 floor at y = `floor`. All of this is ours: the paper has the foot-sliding ratio of section 4.4.
 """
 
-from __future__ import annotations
-
 from itertools import groupby
 
 import numpy as np

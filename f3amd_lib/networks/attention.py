@@ -1,7 +1,5 @@
 """Attention and the Transformer encoder block (paper section 3.4.1; Vaswani et al. 2017)."""
 
-from __future__ import annotations
-
 import functools
 
 import jax

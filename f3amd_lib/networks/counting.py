@@ -1,7 +1,5 @@
 """How many operations a function needs, counted from what JAX would run."""
 
-from __future__ import annotations
-
 import math
 
 import jax

@@ -5,8 +5,6 @@ trained with, and what its training does differently. All stand in `papers/*/pre
 paper brings a file of its own and, where its network is a new one, a line of `[families]` in it.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import pkgutil

@@ -10,8 +10,6 @@ and sine matrix: the same numbers as an FFT, and faster on the hardware this was
 the cosine transform.
 """
 
-from __future__ import annotations
-
 import functools
 
 import jax

@@ -1,7 +1,5 @@
 """What the papers print, in the form of our records: tidy tables of `SCHEMAS`, models by their presets' names."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -4,8 +4,6 @@ Each entry that is a setting names the field that holds it, and its value is rea
 that the table in the notebooks shows what runs.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import pkgutil
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Trained models as files: weights and all that is needed to use them, in the form of `ground.trees`."""
 
-from __future__ import annotations
-
 import functools
 from dataclasses import dataclass
 from pathlib import Path

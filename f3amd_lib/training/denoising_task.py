@@ -5,8 +5,6 @@ One step of training: `DenoisingTask.draw` cuts a batch of windows and noise lev
 (`training.losses`); `training.optimise` takes the step.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 

@@ -5,8 +5,6 @@ units, or with `raw_features` in those of CAMDM's code. Weights are fields of `L
 sets them all to 1.
 """
 
-from __future__ import annotations
-
 import jax.numpy as jnp
 
 from f3amd_lib.data.features import frame_positions

@@ -8,8 +8,6 @@ step k comes from the seed and k alone, so that a run that was killed and resume
 weights as one that was not.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import json

@@ -7,14 +7,12 @@ Everything a run leaves lies in `runs/<data set>/<profile>/models/`: the model, 
 project lies in `f3amd_lib/pretrained/<data set>/` in the same form.
 """
 
-from __future__ import annotations
-
 import functools
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import jax
 import numpy as np
@@ -127,7 +125,7 @@ class ModelFiles(NamedTuple):
     history: Path
 
     @classmethod
-    def of(cls, folder, name: str) -> ModelFiles:
+    def of(cls, folder, name: str) -> Self:
         """Return the files of a model of this name in a folder."""
         return cls(*(Path(folder) / f"{name}.{what}" for what in ("safetensors", "state.safetensors", "history.csv")))
 
