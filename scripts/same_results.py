@@ -36,6 +36,7 @@ import pandas as pd
 from safetensors.numpy import load_file
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this tree's library, whatever is installed
+sys.path.insert(1, str(Path(__file__).resolve().parents[1] / "notebooks"))
 
 from f3amd_notebooks.beside_printed import beside_printed
 

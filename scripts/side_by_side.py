@@ -19,6 +19,9 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this tree's library, whatever is installed
+sys.path.insert(1, str(Path(__file__).resolve().parents[1] / "notebooks"))
+
+from f3amd_notebooks.shown import follow_clip
 
 from f3amd_lib.drawing.pictures import draw_crowd
 from f3amd_lib.drawing.stick_figures import TARGET_COLOR, Camera
@@ -27,7 +30,6 @@ from f3amd_lib.ground.files import whole_file
 from f3amd_lib.ground.profiles import load_profile, repository_root
 from f3amd_lib.ground.records import run_record
 from f3amd_lib.ground.trees import weights_digest
-from f3amd_lib.measures.real_clips import follow_clip
 from f3amd_lib.motion.skeleton import resample
 from f3amd_lib.rollout.rollout import MotionGenerator
 from f3amd_lib.training.checkpoints import load_model

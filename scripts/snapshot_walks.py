@@ -16,12 +16,14 @@ from pathlib import Path
 import tyro
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this tree's library, whatever is installed
+sys.path.insert(1, str(Path(__file__).resolve().parents[1] / "notebooks"))
+
+from f3amd_notebooks.shown import follow_longest
 
 from f3amd_lib.ground.files import write_whole
 from f3amd_lib.ground.profiles import load_profile, repository_root
 from f3amd_lib.ground.records import run_record
 from f3amd_lib.ground.trees import weights_digest
-from f3amd_lib.measures.real_clips import follow_longest
 from f3amd_lib.motion.bvh import write_bvh
 from f3amd_lib.rollout.rollout import MotionGenerator
 from f3amd_lib.training.checkpoints import load_model

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from builders import SKELETON, packed_from, refused, stiff_walk, walks_and_runs
+from f3amd_notebooks import shown
 
 from f3amd_lib.data.features import world_frames
 from f3amd_lib.measures import real_clips
@@ -51,20 +52,20 @@ def test_own_path_keeps_a_line_and_loses_the_sway():
 
 def test_a_clip_is_followed_from_its_own_first_frames(packed):
     whole = packed.motion(4)
-    history, path, real = real_clips.follow_clip(packed, 4, num_history=5, num_frames=20)
+    history, path, real = shown.follow_clip(packed, 4, num_history=5, num_frames=20)
     np.testing.assert_allclose(history[0], world_frames(whole)[:5], atol=1e-6)
     assert path.num_frames == real.num_frames == 20
     np.testing.assert_array_equal(real.root_position, whole.root_position[5:25])
     np.testing.assert_array_equal(path.position, real_clips.own_path(whole).position[5:25])
     with pytest.raises(ValueError, match=f"{whole.num_frames} frames, 1005 are needed"):
-        real_clips.follow_clip(packed, 4, num_history=5, num_frames=1000)
+        shown.follow_clip(packed, 4, num_history=5, num_frames=1000)
 
 
 def test_the_longest_held_out_clip_of_a_style_is_followed():
     held_out = [(stiff_walk(step, frames), 0, 2) for step, frames in ((0.041, 60), (0.039, 90), (0.04, 70))]
     packed = packed_from([(stiff_walk(0.04, 200), 0, TRAIN), (stiff_walk(0.04, 200), 1, TRAIN), *held_out])
-    found = real_clips.follow_longest(packed, "calm", num_history=5, num_frames=20)
-    wanted = real_clips.follow_clip(packed, 3, num_history=5, num_frames=20)
+    found = shown.follow_longest(packed, "calm", num_history=5, num_frames=20)
+    wanted = shown.follow_clip(packed, 3, num_history=5, num_frames=20)
     np.testing.assert_array_equal(found[0], wanted[0])
     np.testing.assert_array_equal(found[2].positions, wanted[2].positions)
 

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 
-from f3amd_lib.data.features import world_frames
 from f3amd_lib.data.packed import PackedMotion
 from f3amd_lib.data.sources import SPLITS
 from f3amd_lib.ground.names import check_known
@@ -121,32 +120,6 @@ def own_path(motion: Motion, frames: int = 41) -> RootPath:
     return RootPath(savgol_filter(path.position, span, 2, axis=0), savgol_filter(path.yaw, span, 2), path.fps)
 
 
-def follow_clip(
-    packed: PackedMotion, clip: int, *, num_history: int, num_frames: int
-) -> tuple[np.ndarray, RootPath, Motion]:
-    """Return what a model needs to walk where a real clip walked, and what that clip did.
-
-    Args:
-      packed: the data set.
-      clip: its number.
-      num_history: frames that the model is given, the clip's first.
-      num_frames: frames that it is to make after them.
-
-    Returns:
-      (history, path, motion): world frames [1, num_history, C]; the clip's own line (`own_path`)
-      and its motion over the frames that follow, num_frames each.
-
-    Raises:
-      ValueError: if there is no such clip, or it is too short.
-    """
-    whole = packed.motion(clip)
-    end = num_history + num_frames
-    if whole.num_frames < end:
-        raise ValueError(f"clip {whole.name!r} has {whole.num_frames} frames, {end} are needed: ask for fewer")
-    history = world_frames(whole)[None, :num_history].astype(np.float32)
-    return history, own_path(whole).slice(num_history, end), whole.slice(num_history, end)
-
-
 def reference_clips(packed: PackedMotion, styles: Sequence[str], *, window: int, split: str = "test") -> list[int]:
     """List the real clips that stand beside a rollout: held out, same styles, same speeds.
 
@@ -181,15 +154,6 @@ def reference_clips(packed: PackedMotion, styles: Sequence[str], *, window: int,
             f"data set {packed.name!r} has no {split} clip of {', '.join(styles)} with more than {window + 1} frames"
         )
     return clips
-
-
-def follow_longest(
-    packed: PackedMotion, style: str, *, num_history: int, num_frames: int
-) -> tuple[np.ndarray, RootPath, Motion]:
-    """Return what `follow_clip` does of the longest held-out clip of a style."""
-    clips = reference_clips(packed, [style], window=num_frames)
-    longest = max(clips, key=lambda clip: packed.motion(clip).num_frames)
-    return follow_clip(packed, longest, num_history=num_history, num_frames=num_frames)
 
 
 # ------------------------------------------------------------------- measured alike: clips and rollouts

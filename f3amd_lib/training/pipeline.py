@@ -24,7 +24,7 @@ from f3amd_lib.data.packed import PackedMotion, packed_dataset
 from f3amd_lib.data.sources import SPLITS, open_dataset
 from f3amd_lib.data.windows import WindowSet, build_windows, fit_normaliser, starting_poses
 from f3amd_lib.ground.files import locked, set_aside
-from f3amd_lib.ground.profiles import PRETRAINED_DIR, Profile, load_profile, runs_dir
+from f3amd_lib.ground.profiles import PRETRAINED_DIR, Profile, runs_dir
 from f3amd_lib.ground.records import read_table, run_record, whole_table, write_table
 from f3amd_lib.ground.trees import describe
 from f3amd_lib.networks import presets
@@ -306,32 +306,6 @@ def obtain_model(
         set_aside_run(files)
     set_aside_other_state(files, identity)
     return *train(prepared, profile, preset=preset, progress=progress), "trained now"
-
-
-def shipped_weights(dataset: str) -> Path | None:
-    """Return the weights whose motion is shown of a data set, None where none ship."""
-    weights = model_files(load_profile("laptop", dataset), folder=PRETRAINED_DIR / dataset).model
-    return weights if weights.is_file() else None
-
-
-def shown_model(prepared: PreparedData, profile: Profile, *, progress: bool = True) -> tuple[TrainedModel, str]:
-    """Return the model whose motion a reader sees: what ships for the data set, in any profile.
-
-    Args:
-      prepared: the data; its styles must be among the model's.
-      profile: names the data set; where nothing ships for it, the profile's own model is obtained.
-      progress: as for `obtain_model`.
-
-    Returns:
-      (model, origin), origin as from `obtain_model`.
-    """
-    shipped = shipped_weights(profile.dataset)
-    if profile.name == "smoke" and shipped:
-        trained = load_model(shipped)
-        if set(prepared.packed.styles) <= set(trained.styles) and trained.skeleton == prepared.packed.skeleton:
-            return trained, "shipped"
-    trained, _, origin = obtain_model(prepared, profile, progress=progress)
-    return trained, origin
 
 
 def finished_model(prepared: PreparedData, profile: Profile, preset: str, files: ModelFiles) -> TrainedModel | None:
