@@ -18,8 +18,8 @@ import numpy as np
 from f3amd_companion.speed.machine import usable_cores
 from f3amd_lib.diffusion.samplers import ddim_step, ddpm_step
 from f3amd_lib.ground.names import check_known
-from f3amd_lib.networks.attention import position_code
-from f3amd_lib.networks.camdm import CAMDM, POSITION_BASE, CAMDMConfig, step_features
+from f3amd_lib.networks.attention import position_code, sinusoids
+from f3amd_lib.networks.camdm import CAMDM, POSITION_BASE, CAMDMConfig
 from f3amd_lib.networks.conditioning import Condition, noise_features
 from f3amd_lib.networks.config import scaled_input
 
@@ -203,7 +203,7 @@ def tell_levels(config: CAMDMConfig, sigmas) -> tuple[np.ndarray, np.ndarray]:
     if config.noise_levels:
         known = np.log(config.noise_levels)
         numbers = np.interp(np.log(sigmas), known, np.arange(len(known)))
-        features = step_features(jnp.asarray(numbers, jnp.float32), config.latent_width)
+        features = sinusoids(jnp.asarray(numbers, jnp.float32), config.latent_width, POSITION_BASE)
     else:
         features = noise_features(jnp.asarray(sigmas), config.latent_width)
     return scales, np.array(features, np.float32)

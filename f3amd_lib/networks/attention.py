@@ -7,6 +7,17 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
+from f3amd_lib.ground.arrays import array_module
+
+
+def sinusoids(place, width: int, base: float):
+    """Return sines and cosines of a place by turns, [...] -> [..., width], at rates from 1 down to near 1 / base."""
+    xp = array_module(place)
+    rate = xp.exp(-xp.log(base) * xp.arange(0, width, 2) / width)
+    angle = xp.asarray(place)[..., None] * rate
+    paired = xp.stack([xp.sin(angle), xp.cos(angle)], axis=-1)
+    return paired.reshape(*angle.shape[:-1], -1)[..., :width]
+
 
 @functools.lru_cache(maxsize=64)
 def position_code(first: int, last: int, width: int, base: float = 1000.0) -> np.ndarray:
@@ -24,11 +35,7 @@ def position_code(first: int, last: int, width: int, base: float = 1000.0) -> np
     Returns:
       [last - first, width], float64, read-only (it is cached).
     """
-    frame = np.arange(first, last)[:, None]
-    rate = np.exp(-np.log(base) * np.arange(0, width, 2) / width)[None, :]
-    code = np.zeros((last - first, width))
-    code[:, 0::2] = np.sin(frame * rate)
-    code[:, 1::2] = np.cos(frame * rate)[:, : width // 2]
+    code = sinusoids(np.arange(first, last), width, base)
     code.setflags(write=False)
     return code
 

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from f3amd_lib.networks.attention import TransformerBlock, check_num_heads, dropout, position_code
+from f3amd_lib.networks.attention import TransformerBlock, check_num_heads, dropout, position_code, sinusoids
 from f3amd_lib.networks.conditioning import Condition, ConditionedConfig, noise_features
 from f3amd_lib.networks.config import DenoisingNetwork, scaled_input
 
@@ -61,17 +61,6 @@ class CAMDMConfig(ConditionedConfig):
         """Length of the sequence that the Transformer reads."""
         path = 2 if self.split_path else 1
         return 2 + path * self.window + self.num_history + self.window
-
-
-def step_features(step, width: int):
-    """Return the sinusoidal row of a diffusion step's number, [...] -> [..., width].
-
-    Whole steps give the rows of `position_code`; a level between two steps lies between.
-    """
-    rate = jnp.exp(-jnp.log(POSITION_BASE) * jnp.arange(0, width, 2) / width)
-    angle = jnp.asarray(step)[..., None] * rate
-    paired = jnp.stack([jnp.sin(angle), jnp.cos(angle)], axis=-1)
-    return paired.reshape(*angle.shape[:-1], -1)[..., :width]
 
 
 class CAMDM(DenoisingNetwork):
@@ -128,7 +117,8 @@ class CAMDM(DenoisingNetwork):
             known = np.log(config.noise_levels)
             share = (jnp.log(sigma)[..., None] - known[:-1]) / np.diff(known)
             steps = jnp.clip(share, 0.0, 1.0).sum(axis=-1).astype(dtype)
-            features = step_features(steps, width)
+            # A whole step has its row of `position_code`, a level between two steps lies between.
+            features = sinusoids(steps, width, POSITION_BASE)
         else:
             features = noise_features(sigma, width)
         return self.noise_second(nnx.silu(self.noise_first(features)))
