@@ -37,10 +37,10 @@ from f3amd_lib.text.stages.acmdm_training import (
     noisy_state,
 )
 from f3amd_lib.text.stages.motionpcm_training import LatentMotionTraining
-from f3amd_lib.text.stages.text_models import MotionCodec, with_latent
+from f3amd_lib.text.stages.text_models import MotionCodec
+from f3amd_lib.text.stages.train_stage import stage_recipe
 from f3amd_lib.training.checkpoints import network_with
 from f3amd_lib.training.optimise import initial_state, optimise
-from f3amd_lib.training.recipe import part_recipe, profile_part_recipe
 
 BETAS = variance_preserving_betas(50, 0.002, 0.4, power=1)
 CLIPS, FRAMES, JOINTS = 6, 40, 3
@@ -82,7 +82,7 @@ RAW = table(NORMALISED, MASK)
 
 def latent_codec():
     params = nnx.state(presets.build_from_config(AUTOENCODER, jax.random.key(2)))
-    return with_latent(CODEC, AUTOENCODER, params, NORMALISED, MASK)
+    return CODEC.with_latent(AUTOENCODER, params, NORMALISED, MASK)
 
 
 def recipe(**settings):
@@ -104,16 +104,15 @@ def recipe(**settings):
     ],
 )
 def test_the_gpu_trains_as_long_as_the_paper_and_others_as_long_as_they_are_asked(training, part, preset, steps):
-    made = lambda profile, **asked: profile_part_recipe(
-        training, part, load_profile(profile, "bandai", **asked), preset
-    )
+    made = lambda profile, **asked: stage_recipe(training, part, load_profile(profile, "bandai", **asked), preset)
     assert made("gpu").num_steps == steps and made("gpu", train_steps=70).num_steps == 70
     few, many = (made("laptop", train_steps=count).num_steps for count in (1000, 12_000))
     assert many == 12 * few < steps
 
 
 def test_the_rate_warms_up_and_drops_as_told():
-    paper = dataclasses.replace(part_recipe(TextMotionTraining, "denoiser", 100_000), drops=(50_000, 70_000))
+    gpu = load_profile("gpu", "bandai", train_steps=100_000)
+    paper = dataclasses.replace(stage_recipe(TextMotionTraining, "denoiser", gpu), drops=(50_000, 70_000))
     steps = (0, 999, 1999, 49_999, 50_000, 70_000)
     rates = [float(paper.rate(jnp.asarray(step))) for step in steps]
     np.testing.assert_allclose(rates, 2e-4 * np.array([1 / 2000, 0.5, 1, 1, 0.1, 0.01]), rtol=1e-5)

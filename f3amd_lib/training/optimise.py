@@ -26,7 +26,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from tqdm import tqdm
 
 from f3amd_lib.ground.trees import load_tree, save_tree
-from f3amd_lib.networks.config import CheckedConfig, with_fast_gradient
+from f3amd_lib.networks.config import with_fast_gradient
 from f3amd_lib.networks.presets import build_from_config
 
 SPREAD, EVERYWHERE = PartitionSpec("batch"), PartitionSpec()
@@ -67,8 +67,9 @@ class Task:
     gradient where it should not flow, and an optimiser that treats branches differently
     (`optax.partition`; `optax.set_to_zero` freezes one).
 
-    Here is what trainings of one network share. Such a one has `model_config`, `dataset_fingerprint`, perhaps
-    `schedule`, and says what is drawn and how it is judged:
+    Here is what trainings of one network share. Such a one has a `model_config`, and says what it is, what is drawn and
+    how that is judged:
+      identity(): all that decides the weights, JSON-ready, so that a state is resumed only where it belongs.
       draw(state, key): (batch, key of the loss); arrays of a batch have the samples first.
       terms(params, batch, key, training=True): loss terms by name, "loss" among them, of what `draw` drew or, out of
         training, of held-out data.
@@ -76,26 +77,16 @@ class Task:
 
     Attributes:
       name: of what is trained, for progress bars and errors.
-      part: what its identity calls its network.
       config: settings: `num_steps` in all, `ema_decay` of the moving average of the weights (None keeps none), `seed`
         of initial weights and batches, and `optimiser()`.
     """
 
     name: ClassVar[str]
-    part: ClassVar[str]
 
     @property
     def optimiser(self) -> optax.GradientTransformation:
         """What turns gradients into updates, as the config says."""
         return self.config.optimiser()
-
-    def identity(self) -> dict:
-        """Return all that decides the weights, JSON-ready, so that a state is resumed only where it belongs."""
-        models = {self.part: self.model_config.to_dict()}
-        if hasattr(self, "schedule"):
-            models["diffusion"] = self.schedule.to_dict()
-        training, fingerprint = dataclasses.asdict(self.config), self.dataset_fingerprint
-        return {"part": self.name, "model": models, "training": training, "dataset_fingerprint": fingerprint}
 
     def init(self, key) -> tuple[Any, Any]:
         """Return (weights, statistics) before the first step; no network here keeps statistics."""
@@ -109,23 +100,6 @@ class Task:
     def held_out_terms(self, params, statistics, held_out, key) -> dict:
         """Return terms by name on held-out data, without what only training does; asked where such data are given."""
         return self.terms(params, held_out, key, training=False)
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class ClipsTask(Task):
-    """A training of one network on clips, whole or as states; a subclass adds what else it goes by.
-
-    Attributes:
-      model_config: the network.
-      config: how to train it.
-      clips: of the training split, on the device.
-      dataset_fingerprint: of the data they come from, and of the networks it stands on.
-    """
-
-    model_config: CheckedConfig
-    config: Any
-    clips: Any
-    dataset_fingerprint: str = dataclasses.field(default="", kw_only=True)
 
 
 def frozen_tree(*data: str):

@@ -15,9 +15,8 @@ import optax
 
 from f3amd_lib.diffusion.schedules import NoiseSchedule, schedule_from_dict, variance_exploding
 from f3amd_lib.ground.files import read_toml
-from f3amd_lib.ground.names import check_known, checked_value, refuse_unknown
-from f3amd_lib.ground.papers import load_paper_file
-from f3amd_lib.ground.profiles import Profile, load_profile
+from f3amd_lib.ground.names import checked_value, refuse_unknown
+from f3amd_lib.ground.profiles import Profile
 from f3amd_lib.networks.presets import find_preset
 
 _SETTINGS = read_toml(Path(__file__).with_name("settings.toml"))
@@ -212,41 +211,6 @@ def profile_recipe(profile: Profile, preset: str | None = None) -> TrainingConfi
     recipe = paper_recipe if as_printed else short_recipe
     own = {name: getattr(profile, name) for name in ("learning_rate", "batch_size", "seed")}
     return recipe(preset, profile.train_steps, **own)
-
-
-def part_recipe(training: type, part: str, num_steps: int, preset: str | None = None, **settings):
-    """Return how a part of a paper's model is trained.
-
-    Args:
-      training: class of the settings; its `paper` names the folder of the recipes.
-      part: a name of `papers/<paper>/recipes.toml`, "denoiser" or "short-denoiser" for instance.
-      num_steps: optimiser steps.
-      preset: adds what its own training says (`presets.find_preset`).
-      **settings: fields to change.
-
-    Raises:
-      ValueError: for an unknown part, preset or field, with the nearest name.
-    """
-    recipes = load_paper_file("recipes", training.paper)
-    check_known(part, recipes, "recipe")
-    own = {} if preset is None else find_preset(preset).training
-    values = {**recipes[part]["training"], **own, **settings}
-    refuse_unknown(values, training, "training setting")
-    return training(num_steps, **values)
-
-
-def profile_part_recipe(training: type, part: str, profile: Profile, preset: str | None, batch_size=None, **settings):
-    """Return how a profile trains a part: by the paper's recipe on `gpu`, by the short one and its share elsewhere.
-
-    Where the profile's number of steps is the usual one, a recipe's own goes before it.
-    """
-    settings |= {} if batch_size is None else {"batch_size": batch_size}
-    name = part if profile.name == "gpu" else f"short-{part}"
-    recipe, num_steps = load_paper_file("recipes", training.paper)[name], profile.train_steps
-    if num_steps == load_profile(profile.name, profile.dataset).train_steps:
-        num_steps = recipe.get("num_steps", num_steps)
-    num_steps = max(1, round(recipe.get("share", 1.0) * num_steps))
-    return part_recipe(training, name, num_steps, preset, seed=profile.seed, **settings)
 
 
 def learning_rate_schedule(config: TrainingConfig) -> optax.Schedule:

@@ -32,9 +32,9 @@ from f3amd_lib.text.data.redundant import canonical_start, essential_features
 from f3amd_lib.text.data.text_encoders import TextEmbeddings, TextEncoder, embed_captions
 from f3amd_lib.text.data.text_motions import MOST_FRAMES, UNIT, AxisNormaliser, TextMotions, draw_clips, pad_motions
 from f3amd_lib.text.judge import text_metrics
-from f3amd_lib.text.stages.text_models import JUDGE, CaptionedModel, load_text_model, save_text_model
+from f3amd_lib.text.stages.text_models import JUDGE, CaptionedModel, ClipsTask, load_text_model, save_text_model
 from f3amd_lib.training.checkpoints import network_with
-from f3amd_lib.training.optimise import ClipsTask, TrainingState, frozen_tree, optimise
+from f3amd_lib.training.optimise import TrainingState, frozen_tree, optimise
 from f3amd_lib.training.pipeline import ModelFiles
 from f3amd_lib.training.recipe import check_settings
 

@@ -37,9 +37,9 @@ from f3amd_lib.text.networks.acmdm import (
     spoil,
 )
 from f3amd_lib.text.networks.autoencoders import smooth_l1, variational_loss
-from f3amd_lib.text.stages.text_models import PELVIS, Asked, MotionCodec, TextModel, controlled_joints, with_latent
+from f3amd_lib.text.stages.text_models import PELVIS, Asked, ClipsTask, MotionCodec, TextModel, controlled_joints
 from f3amd_lib.training.checkpoints import network_with
-from f3amd_lib.training.optimise import ClipsTask, TrainingState, frozen_tree
+from f3amd_lib.training.optimise import TrainingState, frozen_tree
 from f3amd_lib.training.recipe import check_settings
 
 _ENCODED_AT_ONCE = 64
@@ -196,7 +196,7 @@ class AutoencoderTask(ClipsTask):
         frames, codec = self.model_config.frames_per_latent, getattr(self, "codec", asked.codec)
         clips = [codec.axes.normalise(asked.data.clip(number)) for number in part]
         motion, _, mask, _ = pad_motions(clips, max(map(len, clips)) // frames * frames)
-        return TextModel(codec=with_latent(codec, self.model_config, state.averaged, motion, mask), **about)
+        return TextModel(codec=codec.with_latent(self.model_config, state.averaged, motion, mask), **about)
 
     def draw(self, state: TrainingState, key):
         """Draw windows [B, window, J, 3] from clips of at least that length."""

@@ -22,9 +22,9 @@ from f3amd_lib.text import phases
 from f3amd_lib.text.data.redundant import grouped_statistics, positions_from_redundant
 from f3amd_lib.text.data.text_motions import AxisNormaliser, TextMotions, clip_table, draw_clips, pad_motions
 from f3amd_lib.text.networks import motionpcm
-from f3amd_lib.text.stages.text_models import Asked, LatentModel
+from f3amd_lib.text.stages.text_models import Asked, ClipsTask, LatentModel
 from f3amd_lib.training.checkpoints import network_with
-from f3amd_lib.training.optimise import ClipsTask, TrainingState, frozen_tree
+from f3amd_lib.training.optimise import TrainingState, frozen_tree
 from f3amd_lib.training.recipe import check_settings
 
 

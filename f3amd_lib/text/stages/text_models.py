@@ -37,7 +37,7 @@ from f3amd_lib.text.networks.acmdm import ControlBranch, blank_branch, branch_wi
 from f3amd_lib.text.networks.autoencoders import AutoencoderConfig, MeshAutoencoderConfig
 from f3amd_lib.training import checkpoints
 from f3amd_lib.training.checkpoints import network_with
-from f3amd_lib.training.optimise import frozen_tree
+from f3amd_lib.training.optimise import Task, frozen_tree
 from f3amd_lib.training.pipeline import PRETRAINED_DIR, ModelFiles
 
 
@@ -111,6 +111,17 @@ class MotionCodec:
             return network.latent_of(normalised, mask)
         return _frame_by_frame(lambda frames: network.encode(self.vertices_of(frames), self.mesh.lists), normalised)
 
+    def with_latent(self, config: AutoencoderConfig, params, normalised, mask) -> MotionCodec:
+        """Return a codec whose state is an autoencoder's latent, normalised by the mean and deviation of each channel.
+
+        Args:
+          config, params: of the trained autoencoder.
+          normalised, mask: motion to take the statistics from, [B, L, J, 3] and [B, L].
+        """
+        codec = dataclasses.replace(self, autoencoder=config, params=params)
+        latent = codec.latent_of(normalised, mask)[codec.state_mask(mask)]
+        return dataclasses.replace(codec, latent=AxisNormaliser.of(latent))
+
 
 _FRAMES_AT_ONCE = 128
 """Of meshes: all vertices of many clips at once would not fit into memory."""
@@ -124,19 +135,6 @@ def _frame_by_frame(function, clips):
     frames = jnp.pad(frames, ((0, -count % size), *[(0, 0)] * (frames.ndim - 1)), mode="edge")
     made = jax.lax.map(function, frames.reshape(-1, size, *frames.shape[1:]))
     return made.reshape(-1, *made.shape[2:])[:count].reshape(*clips.shape[:2], *made.shape[2:])
-
-
-def with_latent(codec: MotionCodec, config: AutoencoderConfig, params, normalised, mask) -> MotionCodec:
-    """Return a codec whose state is an autoencoder's latent, normalised by the mean and deviation of each channel.
-
-    Args:
-      codec: of positions.
-      config, params: of the trained autoencoder.
-      normalised, mask: motion to take the statistics from, [B, L, J, 3] and [B, L].
-    """
-    codec = dataclasses.replace(codec, autoencoder=config, params=params)
-    latent = codec.latent_of(normalised, mask)[codec.state_mask(mask)]
-    return dataclasses.replace(codec, latent=AxisNormaliser.of(latent))
 
 
 CONTROL = "+control"
@@ -512,3 +510,31 @@ class Asked:
         """Return what a model that reads captions says of them."""
         said = [caption for several in self.part("train").captions for caption in several]
         return {"text_encoder": self.encoder.identity, "words": words_of(said)}
+
+
+@dataclass(frozen=True, eq=False)
+class ClipsTask(Task):
+    """A training of one network on clips, whole or as states; a subclass adds what else it goes by.
+
+    Attributes:
+      part: what its identity calls its network.
+      model_config: the network.
+      config: how to train it.
+      clips: of the training split, on the device.
+      dataset_fingerprint: of the data they come from, and of the networks it stands on.
+    """
+
+    part: ClassVar[str]
+
+    model_config: CheckedConfig
+    config: Any
+    clips: Any
+    dataset_fingerprint: str = field(default="", kw_only=True)
+
+    def identity(self) -> dict:
+        """Return all that decides the weights, JSON-ready, so that a state is resumed only where it belongs."""
+        models = {self.part: self.model_config.to_dict()}
+        if hasattr(self, "schedule"):
+            models["diffusion"] = self.schedule.to_dict()
+        training, fingerprint = dataclasses.asdict(self.config), self.dataset_fingerprint
+        return {"part": self.name, "model": models, "training": training, "dataset_fingerprint": fingerprint}

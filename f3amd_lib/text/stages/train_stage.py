@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import dataclasses
 
-from f3amd_lib.ground.profiles import Profile
+from f3amd_lib.ground.names import refuse_unknown
+from f3amd_lib.ground.papers import load_paper_file
+from f3amd_lib.ground.profiles import Profile, load_profile
 from f3amd_lib.ground.records import run_record
 from f3amd_lib.ground.trees import describe, errors_name
 from f3amd_lib.networks import presets
@@ -22,7 +24,6 @@ from f3amd_lib.text.stages import acmdm_training, motionpcm_training, text_model
 from f3amd_lib.text.stages.text_models import LatentModel, MotionCodec, TextModel, load_text_model, preset_and_branch
 from f3amd_lib.training.optimise import differences
 from f3amd_lib.training.pipeline import alone_with, train_in_legs
-from f3amd_lib.training.recipe import profile_part_recipe
 
 STAGES = {
     "motion autoencoder": acmdm_training.AutoencoderTask,
@@ -76,6 +77,31 @@ def _codec_of_positions(data: TextMotions, preset: Preset) -> MotionCodec:
     if preset.network.get("channels") == 3 + NUM_JOINT_FEATURES:
         redundancy = AxisNormaliser.of(data.select(data.members("train")).joint_features())
     return MotionCodec(data.normaliser(), redundancy=redundancy)
+
+
+def stage_recipe(training: type, part: str, profile: Profile, preset: str | None = None, **settings):
+    """Return how a profile trains a stage: by the paper's recipe on `gpu`, by the short one and its share elsewhere.
+
+    Where the profile's number of steps is the usual one, a recipe's own goes before it.
+
+    Args:
+      training: class of the settings; its `paper` names the folder of the recipes.
+      part: a name of `papers/<paper>/recipes.toml`, such as "denoiser", which has "short-denoiser" beside it.
+      profile: says how long and from which seed.
+      preset: adds what its own training says (`presets.find_preset`).
+      **settings: fields to change.
+
+    Raises:
+      ValueError: for an unknown preset or field, with the nearest name.
+    """
+    recipe = load_paper_file("recipes", training.paper)[part if profile.name == "gpu" else f"short-{part}"]
+    num_steps, usual = profile.train_steps, load_profile(profile.name, profile.dataset).train_steps
+    if num_steps == usual:
+        num_steps = recipe.get("num_steps", num_steps)
+    own = {} if preset is None else presets.find_preset(preset).training
+    values = {**recipe["training"], **own, **settings, "seed": profile.seed}
+    refuse_unknown(values, training, "training setting")
+    return training(max(1, round(recipe.get("share", 1.0) * num_steps)), **values)
 
 
 def train_stage(
@@ -132,12 +158,12 @@ def train_stage(
             return None
         if acmdm and before.record["dataset_fingerprint"] != data.fingerprint:
             raise ValueError(f"{lies}: was trained on other data; move it away or name another folder (--out)")
-    settings, codec = {"batch_size": batch_size}, None
+    settings, codec = {} if batch_size is None else {"batch_size": batch_size}, None
     if acmdm:
         codec = _codec_of_positions(data, preset) if before is None else before.codec
         settings["unit"] = max(1, UNIT // codec.frames_per_state)
     own = None if branch else preset.name
-    config = profile_part_recipe(stage.settings, stage.recipe, profile, own, **settings)
+    config = stage_recipe(stage.settings, stage.recipe, profile, own, **settings)
     files = text_models.text_model_files(profile, name, folder=folder)
     lies = next((file for file in (files.model, files.state) if file.exists()), None)
     if lies and (forms := YOUNGER.intersection(preset.network)):
