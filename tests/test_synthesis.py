@@ -1,5 +1,9 @@
 """Benchmarks: what is timed does what is said, and its table counts right."""
 
+import os
+import subprocess
+import sys
+import textwrap
 from unittest import mock
 
 import jax
@@ -111,3 +115,27 @@ def test_parts_are_left_out():
         with mock.patch.object(*replaced):
             assert products() < whole
     assert products() == whole
+
+
+ON_TWO_DEVICES = """
+    import sys
+    sys.path.insert(0, {tests!r})
+    from test_synthesis import *
+    asked = workload(characters=4)
+    made = prepare_round("jit, all devices", asked).call()
+    assert len(made.sharding.device_set) == 2 == len(jax.devices())
+    given = random_condition(asked.config, 4)
+    for device in range(2):
+        mine, key = slice(2 * device, 2 * device + 2), jax.random.fold_in(jax.random.key(0), device)
+        rows = Condition(*(jax.numpy.asarray(part[mine]) for part in given))
+        np.testing.assert_allclose(made[mine], sample_round(asked.network, rows, asked.sigmas, key), atol=1e-4)
+"""
+
+
+@pytest.mark.slow
+def test_each_of_two_devices_samples_its_characters():
+    program = textwrap.dedent(ON_TWO_DEVICES).format(tests=os.path.dirname(__file__))
+    flags = {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "JAX_PLATFORMS": "cpu"}
+    how = {"capture_output": True, "text": True, "timeout": 300, "check": False}
+    done = subprocess.run([sys.executable, "-c", program], env=os.environ | flags, **how)
+    assert done.returncode == 0, done.stderr[-2000:]

@@ -25,7 +25,7 @@ from f3amd_lib.ground.names import check_known
 from f3amd_lib.networks import presets
 from f3amd_lib.networks.conditioning import PATH_CHANNELS, Condition
 from f3amd_lib.networks.config import NetworkConfig, cast_network
-from f3amd_lib.rollout.rounds import sample_round, sample_round_on_devices
+from f3amd_lib.rollout.rounds import sample_round
 
 
 class NotPossible(RuntimeError):
@@ -135,8 +135,20 @@ def _all_devices(workload: Workload) -> Round:
     if len(devices) < 2:
         raise NotPossible("JAX sees one device only: see machine.fast_xla_flags")
     mesh = Mesh(np.array(devices), ("characters",))
-    sharding = NamedSharding(mesh, PartitionSpec("characters"))
-    return jit_round(workload, workload.network, partial(sample_round_on_devices, mesh=mesh), sharding)
+    share, whole = PartitionSpec("characters"), PartitionSpec()
+
+    def sample(network, condition, sigmas, key, sampler):
+        """Sample a round of as many characters on each device, from noise of its own; the network is copied to all."""
+
+        def own(rows, key):
+            key = jax.random.fold_in(key, jax.lax.axis_index("characters"))
+            return sample_round(network, rows, sigmas, key, sampler=sampler)
+
+        return jax.shard_map(own, mesh=mesh, in_specs=(share, whole), out_specs=share, check_vma=False)(
+            condition, key
+        )
+
+    return jit_round(workload, workload.network, sample, NamedSharding(mesh, share))
 
 
 def _check_outside_of_jax(workload: Workload, framework: str) -> None:

@@ -6,7 +6,6 @@ way back to metres come after it.
 
 import jax
 import jax.numpy as jnp
-from jax.sharding import Mesh, PartitionSpec
 
 from f3amd_lib.diffusion.samplers import sample
 
@@ -49,34 +48,3 @@ def sample_round(
     denoise = lambda x_noisy, sigma: network(x_noisy, sigma, context)
     state = jnp.asarray(sigmas[0] if start is None else start, noise.dtype) * noise
     return sample(sampler, denoise, state, sigmas, key=key_steps, unroll=unroll)
-
-
-def sample_round_on_devices(
-    network, condition, sigmas, key=None, *, mesh: Mesh, noise=None, sampler: str = "ddim"
-) -> jax.Array:
-    """Sample one window for every character, an equal share of the characters on each device.
-
-    Characters have nothing to do with each other within a round, so that devices never wait for one
-    another. Processor cores count as devices once XLA is told so
-    (`--xla_force_host_platform_device_count`).
-
-    Args:
-      network, condition, sigmas, key, noise, sampler: as in `sample_round`.
-      mesh: of one axis, all devices to use; their number must divide the number of characters.
-
-    Returns:
-      Clean features, [B, T, C], spread over the devices. With `noise` given and a sampler that
-      draws none, the numbers of `sample_round`; with a key, others: each device draws its own.
-
-    Raises:
-      ValueError: for a number of characters that does not divide; and as `sample_round`.
-    """
-    (axis,) = mesh.axis_names
-
-    def share(condition, key, noise):
-        key = None if key is None else jax.random.fold_in(key, jax.lax.axis_index(axis))
-        return sample_round(network, condition, sigmas, key, noise=noise, sampler=sampler)
-
-    rows, whole = PartitionSpec(axis), PartitionSpec()
-    spread = jax.shard_map(share, mesh=mesh, in_specs=(rows, whole, rows), out_specs=rows, check_vma=False)
-    return spread(condition, key, noise)
