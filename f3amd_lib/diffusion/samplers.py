@@ -164,8 +164,8 @@ class Sampler:
     """How to go from one noise level to the next.
 
     Attributes:
-      step: `step(x_noisy, x0_hat, sigma, sigma_next, denoise, noise)` returns the state at `sigma_next`; it may ask
-        the denoiser again, and has standard normal `noise` if it draws any (else None).
+      step: `step(x_noisy, x0_hat, sigma, sigma_next)` returns the state at `sigma_next`; it is given standard normal
+        noise behind these if it draws any, the denoiser if it asks it again, and alphas where they are told.
       last: instead of `step` in the last interval, which may end at 0; by default `step`.
       draws_noise: whether it needs a random key.
       evaluations: of the network in a step, but one in the last.
@@ -177,30 +177,18 @@ class Sampler:
     evaluations: int = 1
 
 
-def _ddim(x_noisy, x0_hat, sigma, sigma_next, denoise, noise, *alphas):
-    return ddim_step(x_noisy, x0_hat, sigma, sigma_next, *alphas)
-
-
-def _ddim_vp(x_noisy, x0_hat, sigma, sigma_next, denoise, noise):
+def _ddim_vp(x_noisy, x0_hat, sigma, sigma_next):
     """Step in the VP state, with the rescaling before the network that Appendix F leaves unsaid."""
     alpha_bar, alpha_bar_next = alpha_bar_from_sigma(sigma), alpha_bar_from_sigma(sigma_next)
     z = jnp.sqrt(alpha_bar) * x_noisy
     return ddim_step_vp(z, x0_hat, alpha_bar, alpha_bar_next) / jnp.sqrt(alpha_bar_next)
 
 
-def _ddim_literal(x_noisy, x0_hat, sigma, sigma_next, denoise, noise):
-    return ddim_step_literal(x_noisy, x0_hat, sigma, sigma_next)
-
-
-def _ddpm(x_noisy, x0_hat, sigma, sigma_next, denoise, noise):
-    return ddpm_step(x_noisy, x0_hat, sigma, sigma_next, noise)
-
-
-def _euler(x_noisy, x0_hat, sigma, sigma_next, denoise, noise):
+def _euler(x_noisy, x0_hat, sigma, sigma_next):
     return x_noisy + (sigma_next - sigma) * probability_flow_slope(x_noisy, x0_hat, sigma)
 
 
-def _heun(x_noisy, x0_hat, sigma, sigma_next, denoise, noise):
+def _heun(x_noisy, x0_hat, sigma, sigma_next, denoise):
     """Go along the mean of the slopes at both ends (Karras et al. 2022, Algorithm 1)."""
     slope = probability_flow_slope(x_noisy, x0_hat, sigma)
     guess = x_noisy + (sigma_next - sigma) * slope
@@ -209,14 +197,14 @@ def _heun(x_noisy, x0_hat, sigma, sigma_next, denoise, noise):
 
 
 SAMPLERS: dict[str, Sampler] = {
-    "ddim": Sampler(_ddim),
+    "ddim": Sampler(ddim_step),
     "ddim_vp": Sampler(_ddim_vp),
-    "ddpm": Sampler(_ddpm, draws_noise=True),
+    "ddpm": Sampler(ddpm_step, draws_noise=True),
     "euler": Sampler(_euler),
     # At sigma = 0 the slope has no value, so that the last step is DDIM's. It is on grids that end
     # higher, too: the number of evaluations then does not depend on the levels.
-    "heun": Sampler(_heun, last=_ddim, evaluations=2),
-    "ddim_literal": Sampler(_ddim_literal),
+    "heun": Sampler(_heun, last=ddim_step, evaluations=2),
+    "ddim_literal": Sampler(ddim_step_literal),
 }
 """Samplers by name; a noise schedule's `sampler` is one of these. The last is there to be studied
 (an exact denoiser's samples collapse onto its mean), under a name because rollouts choose their
@@ -249,28 +237,21 @@ def _legs(name: str, x_init, sigmas, alphas, key) -> tuple[Sampler, tuple]:
     return sampler, (sigmas[:-1], sigmas[1:], keys, alphas[:-1], alphas[1:])
 
 
-def _take(step: Callable, denoise: Denoiser, x_noisy, leg: tuple):
+def _take(sampler: Sampler, denoise: Denoiser, x_noisy, leg: tuple, *, last: bool = False):
     """Go over one interval; return the state at its end and the clean estimate at its start."""
-    sigma, sigma_next, key, *alphas = leg
+    sigma, sigma_next, key, *more = leg
     x0_hat = denoise(x_noisy, sigma)
-    noise = None if key is None else jax.random.normal(key, x_noisy.shape, x_noisy.dtype)
-    return step(x_noisy, x0_hat, sigma, sigma_next, denoise, noise, *alphas), x0_hat
+    if last and sampler.last:
+        return sampler.last(x_noisy, x0_hat, sigma, sigma_next), x0_hat
+    if sampler.draws_noise:
+        more = [jax.random.normal(key, x_noisy.shape, x_noisy.dtype)]
+    if sampler.evaluations > 1:
+        more = [denoise]
+    return sampler.step(x_noisy, x0_hat, sigma, sigma_next, *more), x0_hat
 
 
 def _pick(legs: tuple, which) -> tuple:
     return jax.tree.map(lambda field: field[which], legs)
-
-
-def _fold(step: Callable, denoise: Denoiser, x_init, legs: tuple, unroll: bool):
-    """Go over all intervals in one scan."""
-    num_steps, x_noisy = len(legs[0]), jnp.asarray(x_init)
-    over = lambda x_noisy, leg: (_take(step, denoise, x_noisy, leg)[0], None)
-    # A scan keeps its loop around a single step, unrolled or not, and also around none.
-    if num_steps == 0:
-        return x_noisy
-    if num_steps == 1:
-        return over(x_noisy, _pick(legs, 0))[0]
-    return jax.lax.scan(over, x_noisy, legs, unroll=num_steps if unroll else 1)[0]
 
 
 def sample(name: str, denoise: Denoiser, x_init, sigmas, *, alphas=None, key=None, unroll: bool = False) -> jax.Array:
@@ -298,11 +279,13 @@ def sample(name: str, denoise: Denoiser, x_init, sigmas, *, alphas=None, key=Non
         are not a list of at least two levels, or `alphas` that do not fit them or the sampler.
     """
     sampler, legs = _legs(name, x_init, sigmas, alphas, key)
-    if sampler.last is None:
-        return _fold(sampler.step, denoise, x_init, legs, unroll)
-    # Apart from the scan: masked inside, it would cost an evaluation that nobody uses.
-    x_noisy = _fold(sampler.step, denoise, x_init, _pick(legs, slice(-1)), unroll)
-    return _take(sampler.last, denoise, x_noisy, _pick(legs, -1))[0]
+    # What ends otherwise ends apart: masked inside the scan, it would cost an evaluation that nobody uses.
+    alike = len(legs[0]) - (sampler.last is not None)
+    if unroll or alike < 2:  # a scan keeps its loop around a single step, and also around none
+        return [*walk(name, denoise, x_init, sigmas, alphas=alphas, key=key)][-1].x_noisy
+    over = lambda x_noisy, leg: (_take(sampler, denoise, x_noisy, leg)[0], None)
+    x_noisy, _ = jax.lax.scan(over, jnp.asarray(x_init), _pick(legs, slice(alike)))
+    return _take(sampler, denoise, x_noisy, _pick(legs, -1), last=True)[0] if sampler.last else x_noisy
 
 
 class Visited(NamedTuple):
@@ -329,8 +312,7 @@ def walk(name: str, denoise: Denoiser, x_init, sigmas, *, alphas=None, key=None)
     x_noisy, last = jnp.asarray(x_init), len(legs[0]) - 1
     for number in range(last + 1):
         leg = _pick(legs, number)
-        step = sampler.last if sampler.last and number == last else sampler.step
-        x_next, x0_hat = _take(step, denoise, x_noisy, leg)
+        x_next, x0_hat = _take(sampler, denoise, x_noisy, leg, last=number == last)
         yield Visited(x_noisy, leg[0], x0_hat)
         x_noisy = x_next
     yield Visited(x_noisy, legs[1][-1], None)

@@ -87,9 +87,12 @@ def _stranger(name: str, rescales: bool = True):
         kind, x = SAMPLERS[name], jnp.asarray(x_init)
         look = denoise if rescales else lambda x, sigma: denoise(x / np.hypot(1, sigma), sigma)
         for number, (sigma, sigma_next) in enumerate(zip(sigmas[:-1], sigmas[1:], strict=True)):
-            step = kind.last if kind.last and sigma_next == 0 else kind.step
-            noise = jax.random.normal(jax.random.key(number), x.shape)
-            x = step(x, denoise(x, sigma), sigma, sigma_next, look, noise)
+            leg = x, denoise(x, sigma), sigma, sigma_next
+            if kind.last and sigma_next == 0:
+                x = kind.last(*leg)
+            else:
+                noise = [jax.random.normal(jax.random.key(number), x.shape)] if kind.draws_noise else []
+                x = kind.step(*leg, *noise, *[look] * (kind.evaluations - 1))
             x = x if rescales else x / np.hypot(1, sigma_next)
         return x
 
