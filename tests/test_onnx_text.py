@@ -14,13 +14,14 @@ from f3amd_companion.serving.onnx_export import CARD, PROGRAM, OnnxProgram, seed
 from f3amd_lib.diffusion.flow import solve
 from f3amd_lib.diffusion.schedules import straight, variance_preserving_betas
 from f3amd_lib.motion.synthetic import SYNTHETIC_SKELETON
+from f3amd_lib.networks.presets import blank_network
 from f3amd_lib.text.data.text_motions import AxisNormaliser
 from f3amd_lib.text.networks.acmdm import ACMDM, ACMDMConfig, TextCondition
 from f3amd_lib.text.networks.motionpcm import LatentAutoencoderConfig, LatentDenoiser, LatentDenoiserConfig
 from f3amd_lib.text.sampling.motionpcm_sampling import sample_student, sample_teacher
 from f3amd_lib.text.sampling.text_to_motion import text_prediction
 from f3amd_lib.text.stages.text_models import LatentModel, MotionCodec, TextModel, save_text_model
-from f3amd_lib.training.checkpoints import network_with, weights_shapes
+from f3amd_lib.training.checkpoints import network_with
 
 needs_onnx = pytest.mark.needs("jax2onnx", "onnxruntime")
 ABOUT = {"skeleton": SYNTHETIC_SKELETON, "fps": 20.0, "text_encoder": "tiny-8"}
@@ -54,7 +55,7 @@ def acmdm(**changes) -> TextModel:
 def motionpcm(guidance_features: int) -> LatentModel:
     config = LatentDenoiserConfig(**SIZES, text_width=8, time_features=8, guidance_features=guidance_features)
     autoencoder = LatentAutoencoderConfig(**SIZES, features=7)
-    zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), weights_shapes(autoencoder))
+    zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), blank_network(autoencoder)[1])
     record = RECORD | {"identity": {"training": {"num_phases": 2, "skip": 50}}}
     return LatentModel(
         name="tiny-PCM", autoencoder=autoencoder, autoencoder_params=zeros, record=record, config=config,

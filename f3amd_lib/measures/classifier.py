@@ -394,15 +394,6 @@ class ClassifierTraining:
         return optax.adam(optax.cosine_decay_schedule(self.learning_rate, self.num_steps))
 
 
-def _settings(styles: tuple[str, ...], network: ClassifierConfig, config: ClassifierTraining) -> dict:
-    """Return all but the data that decides a classifier's weights, as its record tells it."""
-    return {
-        "classifier": dataclasses.asdict(network),
-        "classifier_training": dataclasses.asdict(config),
-        "classifier_styles": styles,
-    }
-
-
 @frozen_tree("frames", "starts", "first", "count", "mirrored")
 class StyleTask(Task):
     """A style classifier to train.
@@ -455,12 +446,17 @@ class StyleTask(Task):
 
 def _asked_for(
     packed: PackedMotion, *, num_steps: int, batch_size: int, seed: int, **sizes
-) -> tuple[tuple[str, ...], ClassifierConfig, ClassifierTraining]:
-    """Return the classes, which are the primary styles, the network's sizes and its training."""
+) -> tuple[ClassifierConfig, ClassifierTraining, dict]:
+    """Return the network's sizes, its training, and what the record tells of both: all but the data.
+
+    The classes are the data's primary styles.
+    """
     styles = tuple(packed.primary_styles)
     if len(styles) < 2:
         raise ValueError(f"data set {packed.name!r}: a style classifier needs at least two styles, got {len(styles)}")
-    return styles, ClassifierConfig(len(styles), **sizes), ClassifierTraining(num_steps, batch_size, seed)
+    config, training = ClassifierConfig(len(styles), **sizes), ClassifierTraining(num_steps, batch_size, seed)
+    told = {"classifier": dataclasses.asdict(config), "classifier_training": dataclasses.asdict(training)}
+    return config, training, told | {"classifier_styles": styles}
 
 
 def train_classifier(
@@ -498,8 +494,8 @@ def train_classifier(
 
     Source: CAMDM's evaluation code (its classifier).
     """
-    styles, config, training = _asked_for(packed, num_steps=num_steps, batch_size=batch_size, seed=seed, **sizes)
-    window = config.window
+    config, training, told = _asked_for(packed, num_steps=num_steps, batch_size=batch_size, seed=seed, **sizes)
+    styles, window = told["classifier_styles"], config.window
     takes = {split: _collect(packed, styles, members, window) for split, members in _SPLITS.items()}
     frames, labels, _ = takes["train"]
     lengths = [len(part) for part in frames]
@@ -523,7 +519,7 @@ def train_classifier(
     accuracy = {style: float(right[labels == number].mean()) for number, style in enumerate(styles)}
     record = run_record(
         profile=profile, dataset=packed, seed=seed, num_train_windows=len(task.starts),
-        num_held_out_windows=len(labels), **_settings(styles, config, training),
+        num_held_out_windows=len(labels), **told,
     )  # fmt: skip
     return StyleClassifier(config, params, state.statistics, packed.skeleton, styles, accuracy, references, record)
 
@@ -561,8 +557,7 @@ def obtain_classifier(
       ValueError: as `train_classifier`, or naming a file that is broken.
     """
     settings = {"seed": 0} | _PROFILE_TRAINING[profile.name] | changes
-    styles, config, training = _asked_for(packed, **settings)
-    identity = {"dataset_fingerprint": packed.fingerprint, **_settings(styles, config, training)}
+    identity = {"dataset_fingerprint": packed.fingerprint, **_asked_for(packed, **settings)[2]}
     folder = runs_dir(profile.dataset, profile.name) / "classifier"
     path = folder / f"style-classifier-{record_hash(identity)[:12]}.safetensors"
     if path.exists():

@@ -42,12 +42,12 @@ def held_out_condition(windows: WindowSet, trained: TrainedModel, num_conditions
     return network_inputs(held_out_batch(windows, trained, num_conditions), trained.normaliser)[1]
 
 
-def root_mean_square(squares, scale: float = CM) -> dict:
-    """Return the root of a mean over windows, [W], times `scale`, with its 95 % interval."""
+def root_mean_square(squares) -> dict:
+    """Return the root of a mean over windows, [W], of squares in square metres, in cm, with its 95 % interval."""
     interval = mean_and_interval(squares)
     for bound in ("value", "low", "high"):
         # The interval of a mean of squares may reach below 0, that of its root may not.
-        interval[bound] = scale * float(np.sqrt(np.maximum(interval[bound], 0.0)))
+        interval[bound] = CM * float(np.sqrt(np.maximum(interval[bound], 0.0)))
     return interval
 
 
@@ -162,17 +162,17 @@ def seed_spread(
     return diversity(np.stack([trained.joint_positions(generator.sample(key, condition)) for key in keys], axis=1))
 
 
-def noise_use(generator: MotionGenerator, windows: WindowSet, *, low_sigma: float = 0.1, seed: int = 0) -> dict:
+def noise_use(generator: MotionGenerator, windows: WindowSet, *, seed: int = 0) -> dict:
     """Say whether a model uses its noisy input.
 
     Returns:
-      x0_error_ratio: x0 error at `low_sigma` over that at sigma_max; near 1 the input is ignored. A
+      x0_error_ratio: x0 error at sigma = 0.1 over that at sigma_max; near 1 the input is ignored. A
         network that takes the number of a step is asked at its lowest level, if that is higher;
         one with a single level has no such ratio, NaN.
       seed_spread_cm: see `seed_spread`; near 0 every seed gives the same motion.
     """
     top = float(generator.sigmas[0])
-    lowest = max(low_sigma, min(getattr(generator.trained.config, "noise_levels", ()) or (0.0,)))
+    lowest = max(0.1, min(getattr(generator.trained.config, "noise_levels", ()) or (0.0,)))
     low, high = float("nan"), 1.0
     if lowest < top:
         table = x0_error_by_sigma(generator.trained, windows, [lowest, top], seed=seed)

@@ -126,11 +126,6 @@ def unpacked_weights(packed: Any) -> Any:
     )
 
 
-def weights_shapes(config: NetworkConfig) -> Any:
-    """Return the shapes of a network's weights."""
-    return blank_network(config)[1]
-
-
 def save_model(path: Path, trained: TrainedModel, dtype=jnp.bfloat16) -> None:
     """Write a trained model.
 
@@ -168,7 +163,7 @@ def load_model(path: Path) -> TrainedModel:
 
     def shapes(metadata: dict) -> dict:
         check_kind(metadata, "trained model")
-        weights = weights_shapes(config_from_dict(metadata["model"]))
+        weights = blank_network(config_from_dict(metadata["model"]))[1]
         return {"params": packed_shapes(weights, metadata.get("weights"))}
 
     with errors_name(path):

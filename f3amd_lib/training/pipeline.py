@@ -302,9 +302,9 @@ def obtain_model(
         if not _unlike(trained, identity):
             return trained, read_table(files.history)[0], "earlier run"
     # A killed run goes on if nothing has changed since; else its files are kept under other names.
-    if files.model.exists() or not files.history.exists():
+    other = lambda: files.state.exists() and differences(identity, describe(files.state))
+    if files.model.exists() or not files.history.exists() or other():
         set_aside_run(files)
-    set_aside_other_state(files, identity)
     return *train(prepared, profile, preset=preset, progress=progress), "trained now"
 
 
@@ -333,12 +333,6 @@ def finished_model(prepared: PreparedData, profile: Profile, preset: str, files:
 def _unlike(trained: TrainedModel, identity: dict) -> list[str]:
     """List in what a finished model is unlike the one that a run would make."""
     return differences(identity, {**trained.record, "model": trained.config.to_dict()})
-
-
-def set_aside_other_state(files: ModelFiles, identity: dict) -> None:
-    """Keep a training state under another name if it is not of the run to come (`weights_identity`)."""
-    if files.state.exists() and differences(identity, describe(files.state)):
-        set_aside_run(files)
 
 
 def available_models(profile: Profile) -> list[str]:

@@ -362,7 +362,7 @@ def load_text_model(path: Path, *kinds: type[CaptionedModel]) -> TextModel | Lat
             said.update(model={"family": said["kind"], **said["network"]}, weights="float32", name=JUDGE, fps=0.0)
         stated = {"params": said["model"], "autoencoder": said.get("autoencoder")}
         configs.update((part, presets.config_from_dict(config)) for part, config in stated.items() if config)
-        shapes = {part: checkpoints.weights_shapes(config) for part, config in configs.items()}
+        shapes = {part: presets.blank_network(config)[1] for part, config in configs.items()}
         if said.get("controlled"):
             frames = configs["autoencoder"].frames_per_latent if "autoencoder" in configs else 1
             shapes["branch"] = blank_branch(configs["params"], frames)[1]
