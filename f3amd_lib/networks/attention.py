@@ -40,13 +40,6 @@ def position_code(first: int, last: int, width: int, base: float = 1000.0) -> np
     return code
 
 
-def waves(x, width: int, last: float, *, sine_first: bool = False):
-    """Return cosines and then sines of x, [...] -> [..., width], whose frequencies fall from 1 as 10000^(-i / last)."""
-    angle = jnp.asarray(x, jnp.float32)[..., None] * 10000.0 ** (-jnp.arange(width // 2) / last)
-    parts = jnp.cos(angle), jnp.sin(angle)
-    return jnp.concatenate(parts[::-1] if sine_first else parts, axis=-1)
-
-
 def dropout(x, rate: float, key):
     """Set a random share of numbers to zero and enlarge the others, so that the mean stays.
 

@@ -31,7 +31,7 @@ import numpy as np
 from flax import nnx
 
 from f3amd_lib.diffusion.predictions import OBJECTIVES
-from f3amd_lib.networks.attention import check_num_heads, waves
+from f3amd_lib.networks.attention import check_num_heads
 from f3amd_lib.networks.config import CheckedConfig, LayerKeys, scaled_normal
 
 TIME_FEATURES = 256
@@ -58,6 +58,13 @@ class TextContext(NamedTuple):
 
     text: jax.Array
     mask: jax.Array
+
+
+def waves(x, width: int, last: float, *, sine_first: bool = False):
+    """Return cosines and then sines of x, [...] -> [..., width], whose frequencies fall from 1 as 10000^(-i / last)."""
+    angle = jnp.asarray(x, jnp.float32)[..., None] * 10000.0 ** (-jnp.arange(width // 2) / last)
+    parts = jnp.cos(angle), jnp.sin(angle)
+    return jnp.concatenate(parts[::-1] if sine_first else parts, axis=-1)
 
 
 @dataclass(frozen=True, kw_only=True)

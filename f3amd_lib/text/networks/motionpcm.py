@@ -20,8 +20,9 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from f3amd_lib.networks.attention import TransformerBlock, check_num_heads, waves
+from f3amd_lib.networks.attention import TransformerBlock, check_num_heads
 from f3amd_lib.networks.config import CheckedConfig
+from f3amd_lib.text.networks.acmdm import waves
 
 GUIDANCE_SCALE = 1000.0
 """Guidance is multiplied by it before its waves (MotionLCM's released code)."""
