@@ -33,6 +33,7 @@ from flax import nnx
 from f3amd_lib.data.packed import PackedMotion
 from f3amd_lib.data.sources import SPLITS
 from f3amd_lib.ground.arrays import in_batches
+from f3amd_lib.ground.files import read_toml
 from f3amd_lib.ground.names import check_known
 from f3amd_lib.ground.profiles import Profile, runs_dir
 from f3amd_lib.ground.records import record_hash, run_record
@@ -524,12 +525,7 @@ def train_classifier(
     return StyleClassifier(config, params, state.statistics, packed.skeleton, styles, accuracy, references, record)
 
 
-_PROFILE_TRAINING = {
-    "smoke": {"num_steps": 60, "batch_size": 32},
-    "laptop": {"num_steps": 600, "batch_size": 128},
-    "gpu": {"num_steps": 10_000, "batch_size": 1024},
-}
-"""How long a profile trains; `gpu` is CAMDM's 50 epochs of 100STYLE (201,000 windows)."""
+_PROFILE_TRAINING = read_toml(Path(__file__).with_name("classifier.toml"))
 
 
 def obtain_classifier(
