@@ -144,9 +144,7 @@ def _all_devices(workload: Workload) -> Round:
             key = jax.random.fold_in(key, jax.lax.axis_index("characters"))
             return sample_round(network, rows, sigmas, key, sampler=sampler)
 
-        return jax.shard_map(own, mesh=mesh, in_specs=(share, whole), out_specs=share, check_vma=False)(
-            condition, key
-        )
+        return jax.shard_map(own, mesh=mesh, in_specs=(share, whole), out_specs=share, check_vma=False)(condition, key)
 
     return jit_round(workload, workload.network, sample, NamedSharding(mesh, share))
 
