@@ -36,13 +36,13 @@ import pandas as pd
 
 import f3amd_lib
 from f3amd_companion.measuring.fingerprint import real_rows, walk_rows, window_rows
-from f3amd_companion.measuring.runner import Records
+from f3amd_companion.measuring.runner import Records, records_folder
 from f3amd_companion.speed.machine import device_name, matmul_precision
 from f3amd_lib.data.windows import WindowSet
 from f3amd_lib.ground.files import read_toml
 from f3amd_lib.ground.names import check_known
 from f3amd_lib.ground.papers import check_entry, load_paper_file
-from f3amd_lib.ground.profiles import Profile, results_dir
+from f3amd_lib.ground.profiles import Profile
 from f3amd_lib.ground.records import run_record
 from f3amd_lib.ground.trees import errors_name, weights_digest
 from f3amd_lib.measures.classifier import StyleClassifier
@@ -289,8 +289,7 @@ def run_campaign(
         profile=profile, dataset=prepared.packed, seed=protocol.path_seed, measurement=table,
         batch_size=batch_size, protocol=asdict(protocol),
     )  # fmt: skip
-    folder_of_records, keys = results_dir(profile.dataset, profile.name) / "records", {table: ["run", "windows"]}
-    records = Records(folder_of_records, record, keys, known=known)
+    records = Records(records_folder(profile), record, {table: ["run", "windows"]}, known=known)
     if table == "readings" and not records.has(table, {"run": "real", "windows": 0}):
         clips, _ = held_out_clips(prepared.packed, prepared.packed.styles, prepared.window)
         real = real_rows(prepared.packed, clips, window=prepared.window)

@@ -29,13 +29,13 @@ from f3amd_companion.measuring.campaign import RECIPES
 from f3amd_companion.measuring.consistency_task import STUDENT_SPACING, TEACHER_STEPS, distil
 from f3amd_companion.measuring.published import NAME as PUBLISHED
 from f3amd_companion.measuring.published import published_model
-from f3amd_companion.measuring.runner import Records
+from f3amd_companion.measuring.runner import Records, records_folder
 from f3amd_companion.serving.foot_locking import lock_rollout, lock_rollout_online
 from f3amd_companion.speed.measurements import Candidate, time_group
 from f3amd_lib.data.packed import PackedMotion
 from f3amd_lib.ground.names import asked_network
-from f3amd_lib.ground.profiles import Profile, results_dir, runs_dir
-from f3amd_lib.ground.records import run_record, set_aside_table, whole_table, write_table
+from f3amd_lib.ground.profiles import Profile, runs_dir
+from f3amd_lib.ground.records import run_record, write_table
 from f3amd_lib.ground.trees import weights_digest
 from f3amd_lib.measures import denoising
 from f3amd_lib.measures.classifier import StyleClassifier, obtain_classifier
@@ -85,10 +85,6 @@ RECIPE_STEPS = {"smoke": 4, "laptop": 200, "gpu": 20_000}
 _TIMED_CHARACTERS = 32
 
 _PROTOCOL = {"smoke": {"num_seeds": 2, "num_diversity_seeds": 2}}
-
-
-def _records_dir(profile: Profile) -> Path:
-    return results_dir(profile.dataset, profile.name) / "records"
 
 
 def _styles(prepared: PreparedData, profile: Profile) -> list[str]:
@@ -149,23 +145,7 @@ def _measure(
         digests = _digests(trained)
         todo = [row | {"weights": digests.get(asked_network(row["model"]), other)} for row in todo]
     summaries = {} if summary is None else {first.removesuffix("_by_seed"): (first, summary)}
-    return Records(_records_dir(profile), record, keys, again=again or (), summaries=summaries).measure(todo, measure)
-
-
-def _write_anew(
-    prepared: PreparedData, profile: Profile, name: str, table: pd.DataFrame, trained: Mapping[str, TrainedModel],
-    **settings,
-) -> Path:  # fmt: skip
-    """Write a table that is measured as a whole; its record names the weights of its models.
-
-    A table with models that this one lacks is kept under another name.
-    """
-    path = _records_dir(profile) / f"{name}.csv"
-    if (there := whole_table(path)) and not set(there[0].get("model", ())) <= set(table["model"]):
-        log.warning("%s has other models as well: kept as %s", path, set_aside_table(path).name)
-    digests = {model: [digest] for model, digest in _digests(trained).items()}
-    record = _record(prepared, profile, name, **settings, weights_digests=digests)
-    return write_table(path, table, record)
+    return Records(records_folder(profile), record, keys, again=again or (), summaries=summaries).measure(todo, measure)
 
 
 def _real_walks(packed: PackedMotion, profile: Profile, styles: list[str]) -> list[tuple[str, Motion]]:
@@ -362,7 +342,7 @@ def measure_sensitivity(prepared: PreparedData, profile: Profile, models: Iterab
     _refuse_models(models, "the metrics are asked about real motion")
     classifier, protocol, record = protocol_of(prepared, profile, "sensitivity")
     graded = sensitivity.graded_corruptions(prepared.packed, classifier, protocol, progress=True)
-    folder = _records_dir(profile)
+    folder = records_folder(profile)
     if sensitivity.most_windows(classifier):
         write_table(folder / "settling.csv", sensitivity.settling(classifier), record)
     else:
@@ -374,19 +354,24 @@ def measure_foot_spectrum(prepared: PreparedData, profile: Profile, models: Iter
     """Measure how lively feet are in each band of frequency, real and generated with the profile's steps.
 
     Returns:
-      The table `records/foot_spectrum.csv` (see `sensitivity.foot_spectrum`), measured anew.
+      The table `records/foot_spectrum.csv` (see `sensitivity.foot_spectrum`).
     """
-    packed, styles, seed = prepared.packed, _styles(prepared, profile), profile.seed
-    paths = evaluation_paths(packed, styles, profile.rollout_frames, seed=seed)
-    feet = {("real", profile.window, 0): _real_walks(packed, profile, styles)}
-    trained = _models(prepared, profile, models)
-    for name, model in trained.items():
-        log.info("foot spectrum of %s", name)
-        rollout = MotionGenerator(model, profile.num_steps).rollout(paths, styles, seed=seed)
-        walks = [(style, rollout.motion(character)) for character, style in enumerate(styles)]
-        feet[name, profile.window, profile.num_steps] = walks
-    settings = {"num_frames": profile.rollout_frames, "styles": styles}
-    return _write_anew(prepared, profile, "foot_spectrum", sensitivity.foot_spectrum(feet), trained, **settings)
+    styles, num_frames, trained = _styles(prepared, profile), profile.rollout_frames, _models(prepared, profile, models)
+    paths = evaluation_paths(prepared.packed, styles, num_frames, seed=profile.seed)
+    real = _real_walks(prepared.packed, profile, styles)
+
+    def listen(row: Mapping) -> dict:
+        walks = {("real", profile.window, 0): real}
+        if row["steps"]:
+            rollout = MotionGenerator(trained[row["model"]], row["steps"]).rollout(paths, styles, seed=profile.seed)
+            walks[tuple(row[key] for key in ("model", "window_frames", "steps"))] = [
+                (style, rollout.motion(character)) for character, style in enumerate(styles)
+            ]
+        return {"foot_spectrum": sensitivity.foot_spectrum(walks).query("model == @row['model']")}
+
+    record = _record(prepared, profile, "foot_spectrum", num_frames=num_frames, styles=styles)
+    todo = _rows_of(profile, [("real", 0), *((name, profile.num_steps) for name in trained)])
+    return _measure(profile, record, ["foot_spectrum"], todo, listen, again=models, trained=trained)
 
 
 def measure_noise_use(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
@@ -422,19 +407,21 @@ def measure_gradient_norm(prepared: PreparedData, profile: Profile, models: Iter
     """Measure the gradient of the loss that is not scaled against the noise level, at trained weights (claim T5).
 
     Returns:
-      The table `records/gradient_norm.csv` (see `denoising.gradient_norm_by_sigma`), measured anew.
-
-    Raises:
-      ValueError: for more than one model: the table is of one, `F3AMD-FNO-96` by default.
+      The table `records/gradient_norm.csv` (see `denoising.gradient_norm_by_sigma`), of `F3AMD-FNO-96` by default.
     """
-    by_name = _models(prepared, profile, models or ["F3AMD-FNO-96"])
-    if len(by_name) > 1:
-        raise ValueError(f"gradient_norm is a table of one model, got {', '.join(by_name)}: name one with --model")
-    (trained,) = by_name.values()
-    task = prepared.task(trained.name, profile_recipe(profile, trained.name), normaliser=trained.normaliser)
-    held_out = prepared.windows(prepared.held_out_split)
-    table = denoising.gradient_norm_by_sigma(task, trained.params, held_out, SIGMAS, seed=profile.seed)
-    return _write_anew(prepared, profile, "gradient_norm", table.assign(model=trained.name), by_name)
+    trained, held_out = (
+        _models(prepared, profile, models or ["F3AMD-FNO-96"]),
+        prepared.windows(prepared.held_out_split),
+    )
+
+    def slope(row: Mapping) -> dict:
+        model, recipe = trained[row["model"]], profile_recipe(profile, row["model"])
+        task = prepared.task(model.name, recipe, normaliser=model.normaliser)
+        levels = denoising.gradient_norm_by_sigma(task, model.params, held_out, SIGMAS, seed=profile.seed)
+        return {"gradient_norm": levels}
+
+    record, todo = _record(prepared, profile, "gradient_norm"), [{"model": name} for name in trained]
+    return _measure(profile, record, ["gradient_norm"], todo, slope, again=models, trained=trained)
 
 
 def measure_recipes(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
@@ -517,8 +504,11 @@ def measure_round_times(prepared: PreparedData, profile: Profile, models: Iterab
     asked = [Candidate(name, steps, _TIMED_CHARACTERS, "jit") for name in trained for steps in STEPS]
     times, _ = time_group(asked, lambda name, window: trained[name].config, min_rounds=30, min_seconds=5.0)
     called = {"value": "milliseconds", "median_low": "milliseconds_low", "median_high": "milliseconds_high"}
-    table = times[["model", "steps", "characters", *called]].rename(columns=called)
-    return _write_anew(prepared, profile, "round_times", table, trained)
+    keys = ["model", "steps", "characters"]
+    table = times[[*keys, *called]].rename(columns=called).assign(weights=times["model"].map(_digests(trained)))
+    records = Records(records_folder(profile), _record(prepared, profile, "round_times"), {"round_times": keys})
+    records.put("round_times", {}, table)
+    return records.path("round_times")
 
 
 MEASUREMENTS: dict[str, Callable] = {

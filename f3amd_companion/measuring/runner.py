@@ -12,9 +12,15 @@ from pathlib import Path
 
 import pandas as pd
 
+from f3amd_lib.ground.profiles import Profile, results_dir
 from f3amd_lib.ground.records import kept_rows, others_rows, write_table
 
 log = logging.getLogger("f3amd")
+
+
+def records_folder(profile: Profile) -> Path:
+    """Return where the records of a data set and profile lie."""
+    return results_dir(profile.dataset, profile.name) / "records"
 
 
 class Records:
@@ -26,7 +32,7 @@ class Records:
       keys: table -> columns that name a measurement: rows that agree in them are replaced together.
       again: models that are measured again though they have rows.
       known: folder of another run's tables; what they have counts as measured, and they are only read.
-      summaries: further tables, written after each row: name -> (table, function of its rows).
+      summaries: further tables, written with the ones that they sum up: name -> (table, function of its rows).
     """
 
     def __init__(
@@ -42,28 +48,24 @@ class Records:
         """Return where a table lies."""
         return self.folder / f"{name}.csv"
 
-    def _same(self, rows: pd.DataFrame, name: str, row: Mapping) -> pd.Series:
-        """Tell which rows of a table are named as this one."""
-        return (rows[list(self.keys[name])] == [row[key] for key in self.keys[name]]).all(axis=1)
-
     def has(self, name: str, row: Mapping) -> bool:
         """Tell whether a table has rows of this name that agree in all columns of `row`, weights among them."""
-        if row.get("model") in self.again:
-            return False
-        for rows in (self.tables[name], self.known.get(name)):
-            if rows is not None and set(row) <= set(rows):
-                rows = rows[self._same(rows, name, row)]
-                if len(rows) > 0 and all((rows[column] == value).all() for column, value in row.items()):
-                    return True
-        return False
+        tables = [rows for rows in (self.tables[name], self.known.get(name)) if rows is not None and {*row} <= {*rows}]
+        return row.get("model") not in self.again and any(
+            (rows[list(row)] == list(row.values())).all(axis=1).any() for rows in tables
+        )
 
     def put(self, name: str, row: Mapping, rows: pd.DataFrame) -> None:
-        """Put rows in place of those that have the same name, after all others, and write the table."""
+        """Put rows, with what `row` says of all, in place of those of the same names, after all others; write them."""
         rows, earlier = rows.assign(**row), self.tables[name]
         if earlier is not None:
-            rows = pd.concat([earlier[~self._same(earlier, name, row)], rows])
+            old, new = (table.set_index(list(self.keys[name])).index for table in (earlier, rows))
+            rows = pd.concat([earlier[~old.isin(new)], rows])
         self.tables[name] = rows
         self._write(name, rows, name)
+        for summary, (table, summarise) in self.summaries.items():
+            if table == name:
+                self._write(summary, summarise(rows), name)
 
     def _write(self, name: str, rows: pd.DataFrame, source: str) -> None:
         """Write a table; its record names the weights of the table that it was made from, itself or another."""
@@ -86,10 +88,6 @@ class Records:
         for number, row in enumerate(todo, 1):
             named = ", ".join(str(row[key]) for key in self.keys[into])
             log.info("%s, %d of %d: %s", into, number, len(todo), named)
-            measured = measure(row)
-            for name, rows in measured.items():
+            for name, rows in measure(row).items():
                 self.put(name, row, rows)
-            for name, (table, summarise) in self.summaries.items():
-                if table in measured:
-                    self._write(name, summarise(self.tables[table]), table)
         return self.path(next(iter(self.summaries), into))

@@ -23,10 +23,10 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
-from f3amd_companion.measuring.runner import Records
+from f3amd_companion.measuring.runner import Records, records_folder
 from f3amd_lib.ground.names import check_known
 from f3amd_lib.ground.papers import load_paper_file
-from f3amd_lib.ground.profiles import Profile, results_dir, runs_dir
+from f3amd_lib.ground.profiles import Profile, runs_dir
 from f3amd_lib.ground.records import run_record, write_table
 from f3amd_lib.ground.trees import weights_digest
 from f3amd_lib.measures.distributions import intervals_over_repeats
@@ -486,7 +486,7 @@ def measure_text_table(
         check_known(model, [row["model"] for row in rows], f"model of {name}")
     keys = [column for column in rows[0] if column not in ("trained", "first")]
     tables = dict.fromkeys((name, *about.get("beside", ())), keys)
-    records = Records(results_dir(profile.dataset, profile.name) / "records", record, tables, again=asked)
+    records = Records(records_folder(profile), record, tables, again=asked)
 
     def trained(preset: str) -> TextModel | LatentModel | None:
         base = text_models.preset_and_branch(preset)[0]
@@ -602,7 +602,7 @@ def measure_judge(data: TextMotions, encoder: TextEncoder, profile: Profile, *, 
     others = others.select(others.members("train"))
     table = bench.judged(probes_of(bench.real, others, bench.seed), bench.settings["repeats"])
     record = bench.record(profile, data, "text_judge", tremble=TREMBLE)
-    return write_table(results_dir(profile.dataset, profile.name) / "records" / "text_judge.csv", table, record)
+    return write_table(records_folder(profile) / "text_judge.csv", table, record)
 
 
 def counted_hands(skeleton: Skeleton, motions, side: str) -> dict[str, int]:
@@ -665,7 +665,7 @@ def measure_hands(
     asked = list(models or ())
     record = run_record(profile=profile, dataset=data, seed=profile.seed, measurement="hands",
                         text_encoder=encoder.identity, frames=HAND_FRAMES, raised_from=text_metrics.RAISED)  # fmt: skip
-    records = Records(results_dir(profile.dataset, profile.name) / "records", record, {"hands": ["model"]}, again=asked)
+    records = Records(records_folder(profile), record, {"hands": ["model"]}, again=asked)
     rows = {"real clips": lambda: _clip_rows(data, False), "mirrored clips": lambda: _clip_rows(data, True)}
     todo = [{"model": name, "weights": ""} for name in rows]
     for name in asked or [None]:
@@ -706,7 +706,7 @@ def measure_one_caption(
         digests = {"weights": weights_digest(trained.params), "autoencoder": weights_digest(trained.autoencoder_params)}
         steps = motionpcm_sampling.steps_of(trained)
         rows.append(table.assign(model=trained.name, steps=steps, token=range(len(table)), **digests))
-    path = results_dir(profile.dataset, profile.name) / "records" / "text_one_caption.csv"
+    path = records_folder(profile) / "text_one_caption.csv"
     return write_table(path, pd.concat(rows), record)
 
 

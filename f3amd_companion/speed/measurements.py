@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import pandas as pd
 from tqdm import tqdm
 
+from f3amd_companion.measuring.runner import Records, records_folder
 from f3amd_companion.speed import implementations
 from f3amd_companion.speed.implementations import Workload, jit_round
 from f3amd_companion.speed.machine import describe_machine, device_name, matmul_precision, prepared_at_once
@@ -29,8 +30,8 @@ from f3amd_companion.speed.speed_tables import fastest_implementations
 from f3amd_companion.speed.timing import take_turns
 from f3amd_lib.ground.files import read_toml
 from f3amd_lib.ground.names import check_known, row_label
-from f3amd_lib.ground.profiles import Profile, results_dir
-from f3amd_lib.ground.records import kept_rows, read_table, run_record, write_table
+from f3amd_lib.ground.profiles import Profile
+from f3amd_lib.ground.records import read_table, run_record, write_table
 from f3amd_lib.networks import presets
 from f3amd_lib.networks.conditioning import ConditionEncoder, FiLM
 from f3amd_lib.networks.spectral import FNOBlock
@@ -71,10 +72,6 @@ def _circumstances() -> dict:
     """Return what of the machine may change from one group of rows to the next."""
     machine = describe_machine()
     return {"load": machine["load"], "devices": jax.local_device_count(), "xla_flags": machine["xla_flags"]}
-
-
-def _path(profile: Profile, name: str) -> Path:
-    return results_dir(profile.dataset, profile.name) / "records" / f"{name}.csv"
 
 
 # ------------------------------------------------------------------------------------------------- synthesis
@@ -200,14 +197,15 @@ def measure_synthesis_time(
     """
     suites = check_suites(suites or DEFAULT_SUITES[profile.name])
     turns = {"fewest_rounds": 3, **_TURNS.get(profile.name, {})}
-    path, fastest = _path(profile, "synthesis_ways"), _path(profile, "synthesis_time")
     record = _record(prepared, profile, "synthesis_time", turns=turns)
-    kept, keys = kept_rows(path, record), ["suite", *CANDIDATE_COLUMNS]
-    failed = {} if kept is None else read_table(path)[1].get("not_possible", {})
-    done = set() if again or kept is None else set(kept[keys].itertuples(index=False, name=None))
+    keys, summaries = ["suite", *CANDIDATE_COLUMNS], {"synthesis_time": ("synthesis_ways", fastest_implementations)}
+    records = Records(records_folder(profile), record, {"synthesis_ways": keys}, summaries=summaries)
+    path, fastest = map(records.path, ("synthesis_ways", "synthesis_time"))
+    failed = {} if records.tables["synthesis_ways"] is None else read_table(path)[1].get("not_possible", {})
 
     def is_done(suite: str, candidate: Candidate) -> bool:
-        return (suite, *dataclasses.astuple(candidate)) in done or (str(candidate) in failed and not again)
+        named = dict(zip(keys, (suite, *dataclasses.astuple(candidate)), strict=True))
+        return not again and (str(candidate) in failed or records.has("synthesis_ways", named))
 
     todo = [
         (suite, candidates)
@@ -221,19 +219,15 @@ def measure_synthesis_time(
             if stop_at is not None and time.monotonic() >= stop_at:
                 return None
             bar.set_postfix_str("{}: {} frames, {} characters, {}".format(suite, *candidates[0].group))
-            circumstances = _circumstances()
+            circumstances = {"suite": suite} | _circumstances()
             config = lambda model, window: prepared.model_config(model, window=window)
             rows, not_possible = time_group(candidates, config, progress=True, **turns)
             for label, reason in not_possible.items():
                 log.warning("not possible here: %s: %s", label, reason)
             failed |= not_possible
-            if rows.empty:
-                continue
-            # New rows replace those of the same suite and candidates.
-            kept = pd.concat([kept, rows.assign(suite=suite, **circumstances)]).drop_duplicates(keys, keep="last")
-            record |= {"not_possible": failed}
-            write_table(path, kept, record)
-            write_table(fastest, fastest_implementations(kept), record)
+            records.record["not_possible"] = failed
+            if not rows.empty:
+                records.put("synthesis_ways", circumstances, rows)
     return fastest
 
 
@@ -259,11 +253,11 @@ def measure_training_time(
     """
     steps, chunk, batch_size = _TRAINING[profile.name]
     record = _record(prepared, profile, "training_time", steps=steps, chunk=chunk)
-    path, keys = _path(profile, "training_time"), ["model", "window_frames", "device", "batch_size"]
-    kept = kept_rows(path, record)
-    done = set() if again or kept is None else set(kept[keys].itertuples(index=False, name=None))
-    if done.issuperset((name, prepared.window, device_name(), batch_size) for name in _TRAINED):
-        return path
+    keys, again = ["model", "window_frames", "device", "batch_size"], _TRAINED if again else ()
+    records = Records(records_folder(profile), record, {"training_time": keys}, again=again)
+    named = [dict(zip(keys, (name, prepared.window, device_name(), batch_size), strict=True)) for name in _TRAINED]
+    if all(records.has("training_time", row) for row in named):
+        return records.path("training_time")
     if stop_at is not None and time.monotonic() >= stop_at:
         return None
     recipe = partial(short_recipe, num_steps=steps, batch_size=batch_size, seed=profile.seed)
@@ -273,15 +267,13 @@ def measure_training_time(
     calls = {name: _training_call(tasks[name], program) for name, (program, _) in compiled.items()}
     timings = take_turns(calls, min_rounds=-(-steps // chunk), min_seconds=float("inf"), warmup=2, progress=True)
     windows, circumstances, rows = prepared.windows("train").num_windows, _circumstances(), []
-    for name, timing in timings.items():
-        row = dict(zip(keys, (name, prepared.window, device_name(), batch_size), strict=True))
+    for row, (name, timing) in zip(named, timings.items(), strict=True):
         row |= {"precision": precision} | timing.columns("s/step", 1.0 / chunk)
         row |= {"steps_timed": timing.rounds * chunk, "compile_seconds": round(compiled[name][1], 1)}
         row |= {"epoch_windows": windows, "epoch_minutes": timing.median / chunk * windows / batch_size / 60.0}
-        rows.append(row | {"peak_memory_mib": planned_memory(compiled[name][0]) / 2**20} | circumstances)
-    # Rows of other windows and models stay.
-    table = pd.concat([kept, pd.DataFrame(rows)]).drop_duplicates(keys, keep="last")
-    return write_table(path, table, record)
+        rows.append(row | {"peak_memory_mib": planned_memory(compiled[name][0]) / 2**20})
+    records.put("training_time", circumstances, pd.DataFrame(rows))
+    return records.path("training_time")
 
 
 def _compiled(task: DenoisingTask, chunk: int, precision: str):
@@ -362,4 +354,4 @@ def measure_round_parts(prepared: PreparedData, profile: Profile) -> Path:
     config, turns = prepared.model_config("F3AMD-FNO-96"), {"progress": True, **_TURNS.get(profile.name, {})}
     tables = [time_breakdown(Workload("F3AMD-FNO-96", config, 1, characters), **turns) for characters in (1, 32)]
     record = _record(prepared, profile, "round_parts", **_circumstances())
-    return write_table(_path(profile, "round_parts"), pd.concat(tables), record)
+    return write_table(records_folder(profile) / "round_parts.csv", pd.concat(tables), record)
