@@ -251,8 +251,12 @@ def _counted(evidence: Evidence, judge: Callable, between: str, table, metric, r
     return verdicts.pop() if len(verdicts) == 1 else OPEN, text
 
 
-def _measured(models: Mapping, look: Callable[[Mapping], object]) -> list[Mapping]:
-    """Return the models of a family for which `look` finds all it needs; NotMeasured if a required one lacks it."""
+def _measured(models: Mapping | list, look: Callable[[Mapping], object]) -> list[Mapping]:
+    """Return the models of a family for which `look` finds all it needs; NotMeasured if a required one lacks it.
+
+    Of a plain list all are required.
+    """
+    models = models if isinstance(models, Mapping) else {"models": models, "required": models}
     found = lambda model: look(model) if model in models["required"] else known(look, model)
     return [model for model in models["models"] if found(model) is not None]
 
@@ -423,12 +427,6 @@ def worse_in(evidence: Evidence, model, against, metrics, bounds, quantifier) ->
     return every((within(harm, bounds) for harm in harms.values()), order), ", ".join(texts)
 
 
-def worse_in_every_metric(evidence: Evidence, model, against) -> Finding:
-    """Judge, metric by metric, whether a model is worse than another."""
-    shared = _shared_metrics(evidence, [model, against])
-    return _by_metric({metric: {model["model"]: _times_worse(metric, *pair)} for metric, pair in shared.items()})
-
-
 def alike(evidence: Evidence, models, bounds) -> Finding:
     """Judge, metric by metric, whether the largest value of several models over the least lies in a range."""
     spreads = {metric: _spread(models, figures) for metric, figures in _shared_metrics(evidence, models).items()}
@@ -466,31 +464,27 @@ def better_at_each_width(evidence: Evidence, better, worse, widths, metric, wind
     return majority(filter(None, verdicts.values())), ", ".join(texts)
 
 
-def window_loss(evidence: Evidence, models, window, bounds) -> Finding:
-    """Judge, metric by metric, whether no model of a family (of those with both) is much worse with longer windows."""
-    longer = lambda model: model | {"window_frames": window}
-    both = lambda model: [_quality(evidence, each, "FID") for each in (longer(model), model)]
-    models = _measured(models, both)
-    shared = _shared_metrics(evidence, [*map(longer, models), *models])
-    harms = lambda metric: zip(models, shared[metric], shared[metric][len(models) :], strict=False)
-    named = {metric: {one["model"]: _times_worse(metric, *pair) for one, *pair in harms(metric)} for metric in shared}
-    return _by_metric(named, bounds)
+def every_metric(evidence: Evidence, models, ratio_to, bounds=None, either_way=False, least_diversity=0.0) -> Finding:
+    """Judge, metric by metric, models (of a family those that are measured) against rows that `ratio_to` says differ.
 
-
-def steady_over_steps(evidence: Evidence, model, steps, bounds, least_diversity=0.0) -> Finding:
-    """Judge, metric by metric, whether fewer steps give what the model's own number of steps gives.
-
-    A network that gives one motion whatever its noise does so for a dull reason: where samples of
-    one condition differ by less than `least_diversity` cm, nothing was kept.
+    Asked is whether each is worse, with `bounds` how many times worse, `either_way` how many times as large. A network
+    that gives one motion whatever its noise is alike in any number of steps for a dull reason: where samples of one
+    condition differ by less than `least_diversity` cm, nothing was kept.
     """
-    models = [model, *(model | {"steps": count} for count in steps)]
-    shared = _shared_metrics(evidence, models)
-    labels = [f"{count} step{'s' * (count > 1)}" for count in steps]
-    changes = {name: [ratio(figure, own) for figure in fewer] for name, (own, *fewer) in shared.items()}
+    pair = lambda model: (model, model | ratio_to)
+    models = _measured(models, lambda model: [_quality(evidence, each, "FID") for each in pair(model)])
+    shared = _shared_metrics(evidence, [each for model in models for each in pair(model)])
+    steps = lambda count: f"{count} step{'s' * (count > 1)}"
+    labels = [steps(model["steps"]) if "steps" in ratio_to else model["model"] for model in models]
+    change = lambda metric, *figures: ratio(*figures) if either_way else _times_worse(metric, *figures)
+    changes = {
+        name: [change(name, *each) for each in zip(some[::2], some[1::2], strict=True)] for name, some in shared.items()
+    }
     verdict, text = _by_metric({name: dict(zip(labels, some, strict=True)) for name, some in changes.items()}, bounds)
-    spread = max(_quality(evidence, one, "diversity") for one in models)
-    if spread.high < least_diversity:
-        return FAILS, f"{text}; noise changes nothing: samples differ by {figure_text(spread)} cm at most"
+    if least_diversity:
+        spread = max(_quality(evidence, one, "diversity") for model in models for one in pair(model))
+        if spread.high < least_diversity:
+            return FAILS, f"{text}; noise changes nothing: samples differ by {figure_text(spread)} cm at most"
     return verdict, text
 
 
