@@ -60,7 +60,7 @@ def test_a_compressed_decay_ends_where_the_papers_does(schedule, left):
 def test_losses_of_several_readings_add_up_and_the_same_one_twice_is_refused():
     recipe = find_recipe("CAMDM-units+geometry-in-centimetres")
     centimetres = {"position": 1e4, "joint_velocity": 1e4, "foot": 1e4, "ird": 1e2}
-    assert recipe.training["loss"] == {"raw_features": True, **centimetres}
+    assert recipe.loss == {"raw_features": True, **centimetres}
     for twice in ("geometry-in-centimetres+no-IRD", "CAMDM-units+CAMDM-units"):
         with pytest.raises(ValueError, match="the same thing"):
             find_recipe(twice)

@@ -88,6 +88,7 @@ class Recipe:
       preset: what it starts from, unless a row of the queue names another.
       network: fields of the network's config that differ.
       training: fields of the training config that differ.
+      loss: settings of its loss that differ.
     """
 
     name: str
@@ -96,6 +97,7 @@ class Recipe:
     preset: str = "F3AMD-FNO-96"
     network: Mapping = field(default_factory=dict)
     training: Mapping = field(default_factory=dict)
+    loss: Mapping = field(default_factory=dict)
 
     def config(self, num_steps: int, batch_size: int, seed: int) -> TrainingConfig:
         """Return the training config: the paper's, but for the row's change.
@@ -104,7 +106,7 @@ class Recipe:
           num_steps, batch_size, seed: the same for all rows that are compared; a row with a batch of its own sees as
             many windows, in other steps, of which it takes one at least.
         """
-        settings = {"batch_size": batch_size, "seed": seed, **self.training}
+        settings = {"batch_size": batch_size, "seed": seed, "loss": self.loss, **self.training}
         num_steps = max(1, num_steps * batch_size // settings["batch_size"])
         tenth = max(1, num_steps // 10)
         if settings.get("schedule") == "warmup_cosine":
@@ -119,12 +121,10 @@ class Recipe:
         Raises:
           ValueError: if the row changes one of these.
         """
-        if preset == self.preset:
-            return self
-        own = [*self.network, *(name for name in ("loss", "diffusion") if name in self.training)]
-        if self.training.get("loss") == {"raw_features": True}:  # units are any model's
-            own.remove("loss")
-        if own or self.preset != Recipe.preset:
+        # Units of the loss are any model's.
+        also = {"loss": self.loss.keys() - {"raw_features"}, "diffusion": "diffusion" in self.training}
+        own = [*self.network, *filter(also.get, also)]
+        if preset != self.preset and (own or self.preset != Recipe.preset):
             what = f"its {', '.join(own)}" if own else "a recipe of its own"
             raise ValueError(f"{self.name} changes {what} of {self.preset}, so that it is no change of {preset}")
         return replace(self, preset=preset)
@@ -143,16 +143,12 @@ def find_recipe(name: str) -> Recipe:
     parts = name.split("+")
     for part in parts:
         check_known(part, RECIPES, "recipe")
-    if len(parts) == 1:
-        return RECIPES[name]
     rows = [RECIPES[part] for part in parts]
-    losses = [row.training.get("loss", {}) for row in rows]
-    changed = [name for row, loss in zip(rows, losses, strict=True) for name in (*row.network, *row.training, *loss)]
-    if len(set(changed) - {"loss"}) < len(changed) - changed.count("loss") or len({row.preset for row in rows}) > 1:
+    changes = {part: [getattr(row, part) for row in rows] for part in ("network", "training", "loss")}
+    together = {part: dict(ChainMap(*some)) for part, some in changes.items()}
+    clash = any(len(together[part]) < sum(map(len, some)) for part, some in changes.items())
+    if clash or len({row.preset for row in rows}) > 1:
         raise ValueError(f"{name}: these recipes change the same thing, or start from unlike networks; ask for each")
-    together = {field: dict(ChainMap(*(getattr(row, field) for row in rows))) for field in ("network", "training")}
-    if "loss" in together["training"]:
-        together["training"]["loss"] = dict(ChainMap(*losses))
     words = [", ".join(getattr(row, field) for row in rows) for field in ("change", "source")]
     return Recipe(name, *words, rows[0].preset, **together)
 
