@@ -673,7 +673,7 @@ def measure(
     """Measure what notebooks only draw; tables go to <results>/records/.
 
     Args:
-      names: quality, walking, recipes and so on; all if none. Of text to motion (--data bandai) text_judge,
+      names: quality, walking, noise_use and so on; all if none. Of text to motion (--data bandai) text_judge,
         hands, text_table1, text_tableA1, text_table3, text_table4, text_tableA5, text_pcm1 to text_pcm4,
         text_guidance, text_one_caption, by name alone.
       model: this preset; repeatable.

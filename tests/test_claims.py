@@ -204,7 +204,7 @@ def world(true):
                                                 ("toe_power", "toe_power_over_real")))  # fmt: skip
     graded = {"EMD": choose((1, 2, 3), (3, 1, 2)), "FID": choose((1, 3, 2), (1, 2, 3))}
     names = ("noisy motion", "frozen pose")
-    errors = dict(zip((8, 1), choose((1.0, 1.1), (0.5, 0.6)), strict=True))
+    errors = choose(1.0, 0.5)
     flat = lambda sigma: 0.5  # of a network that ignores its input
     vp = choose(lambda sigma: (1.5 if sigma < 5 else 1.0) * exact(sigma), exact)
     curves = {"fno": choose(exact, flat), "ve": choose(exact, flat), "vp": vp}
@@ -228,10 +228,7 @@ def world(true):
             for strength, value in zip((0.0, 0.5, 1.0), values, strict=True)
         ],
         "x0_by_sigma": table("model sigma x0_error", over_levels((0.01, 0.1, 1.0, 10.0, 128.0), **curves)),
-        "recipes": table(
-            "recipe steps joint_error_cm",
-            [("paper", 8, 1.0), ("paper", 1, 1.0), *(("low-noise-weighting", *each) for each in errors.items())],
-        ),
+        "recipe_errors": table("recipe value", [("paper", 1.0), ("low-noise-weighting", errors)], model=FNO),
         "gradient_norm": table("model sigma value", over_levels((0.01, 0.1, 1.0, 10.0, 50.0, 128.0), fno=growth)),
     }
 

@@ -80,7 +80,7 @@ def test_a_preset_is_trained_once_before_all_that_is_measured_of_it():
     ("names", "models", "told"),
     [
         (["wolking"], [A], "walking"),
-        (["recipes"], [A], "unknown measurement by preset 'recipes'"),
+        (["sensitivity"], [A], "unknown measurement by preset 'sensitivity'"),
         (["campaign"], ["CAMDM"], "unknown name in the queue 'CAMDM'"),
     ],
 )

@@ -117,10 +117,7 @@ def power_law(x: Sequence[float], figures: Sequence[Figure]) -> Figure:
 # ------------------------------------------------------------------------------------------- tables
 
 
-_LEAST_STEPS = 10_000
-"""Optimiser steps below which a comparison of recipes decides nothing."""
-
-OF_TRAINED_NETWORKS = ("quality", "quality_by_round", "foot_spectrum", "x0_by_sigma", "gradient_norm")
+OF_TRAINED_NETWORKS = ("quality", "quality_by_round", "foot_spectrum", "x0_by_sigma", "gradient_norm", "recipe_errors")
 """Tables that say how well a network does: it must have passed the gate (`ledger.gate`)."""
 
 
@@ -260,8 +257,6 @@ def recorded_evidence(root, dataset: str, profile: str) -> Evidence:
             raise ValueError(f"{path}: is a record of {' and '.join(map(str, of))}; move it to where those lie")
         if reason := folder_reason(path, record):
             raise NotMeasured(f"{name}.csv {reason}: measure it again")
-        if name == "recipes" and record.get("num_steps", _LEAST_STEPS) < _LEAST_STEPS:
-            raise NotMeasured(f"recipes.csv has trainings of {record['num_steps']} steps: too short to judge by")
         others = [one for paper in paper_folders() for one in load_paper_file("paper", paper).get("others", ())]
         table = printed.checked_table(name, table, str(path), others if name in printed.OF_TEXT else ())
         return table, record, path.relative_to(root).as_posix()
@@ -287,7 +282,8 @@ def snapshot_evidence(root, dataset: str, profile: str) -> list[Evidence]:
       root, dataset, profile: as for `recorded_evidence`.
 
     Returns:
-      Evidence of `quality` for each number of windows: networks by the paper's text alone, means over their seeds.
+      Evidence for each number of windows, means over seeds: `quality` of networks by the paper's text alone, and
+      `recipe_errors`, held-out joint errors of single windows by recipe.
       Then evidence of `quality_by_epoch`: of each network the run with most snapshots. A queue that went on elsewhere
       has rows of several style classifiers; how little most of them differ is in `records/classifiers.csv`.
     """
@@ -295,6 +291,7 @@ def snapshot_evidence(root, dataset: str, profile: str) -> list[Evidence]:
     if not path.exists():
         return []
     table, record = read_table(path)
+    errors = table[(table["metric"] == "held_out_error") & (table["window_frames"] == 32)]
     table = table[table["recipe"] == "paper"].fillna({"unit": ""})
     place, gap = path.relative_to(root).as_posix(), "no {name}.csv of them"
 
@@ -305,7 +302,9 @@ def snapshot_evidence(root, dataset: str, profile: str) -> list[Evidence]:
         where = f"{place} at {windows:,} windows, {most} a network"
         seen = trainings.reset_index().assign(metric="windows", value=windows)
         tables = {"quality": intervals_over_repeats(rows, [*printed.SCHEMAS["quality"], "unit"]), "trained": seen}
-        tables = {name: printed.checked_table(name, one, where) for name, one in tables.items()}
+        of_recipes = errors[errors["windows"] == windows]
+        tables["recipe_errors"] = intervals_over_repeats(of_recipes, printed.SCHEMAS["recipe_errors"])
+        tables = {name: printed.checked_table(name, one, where) for name, one in tables.items() if len(one)}
         found.append(_evidence_of(tables, record, where, gap))
     curves = printed.checked_table("quality_by_epoch", _learning_curves(table), place)
     return [*found, _evidence_of({"quality_by_epoch": curves} if len(curves) else {}, record, place, gap)]

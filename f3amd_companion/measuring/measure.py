@@ -25,7 +25,6 @@ import numpy as np
 import pandas as pd
 
 from f3amd_companion.measuring import sensitivity
-from f3amd_companion.measuring.campaign import RECIPES
 from f3amd_companion.measuring.consistency_task import STUDENT_SPACING, TEACHER_STEPS, distil
 from f3amd_companion.measuring.published import NAME as PUBLISHED
 from f3amd_companion.measuring.published import published_model
@@ -55,7 +54,7 @@ from f3amd_lib.motion.synthetic import walk_along
 from f3amd_lib.rollout.blending import blend_rollout
 from f3amd_lib.rollout.rollout import MotionGenerator
 from f3amd_lib.training.checkpoints import TrainedModel
-from f3amd_lib.training.pipeline import PreparedData, available_models, obtain_model, train
+from f3amd_lib.training.pipeline import PreparedData, available_models, obtain_model
 from f3amd_lib.training.recipe import profile_recipe
 
 log = logging.getLogger("f3amd")
@@ -78,9 +77,6 @@ grid of 2 steps does not visit the middle of its grid of 8, so that its student 
 
 STUDENT_STEPS, STUDENT_BATCH = {"smoke": 4, "laptop": 300, "gpu": 20_000}, 32
 """Optimiser steps of a student by profile, and windows of each."""
-
-RECIPE_STEPS = {"smoke": 4, "laptop": 200, "gpu": 20_000}
-"""Optimiser steps of every row of recipes, by profile; of one with a batch of its own, as many windows."""
 
 _TIMED_CHARACTERS = 32
 
@@ -424,35 +420,6 @@ def measure_gradient_norm(prepared: PreparedData, profile: Profile, models: Iter
     return _measure(profile, record, ["gradient_norm"], todo, slope, again=models, trained=trained)
 
 
-def measure_recipes(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
-    """Train `F3AMD-FNO-96` with one change each, for a short while (see `measuring.campaign`).
-
-    Unfinished runs are gone on with; a row takes some minutes on 2 cores. Rows are recipes, and all
-    are measured.
-
-    Returns:
-      The table `records/recipes.csv`.
-
-    Raises:
-      ValueError: if models are named.
-    """
-    _refuse_models(models, "recipes are rows of their own")
-    num_steps, held_out = RECIPE_STEPS[profile.name], prepared.windows(prepared.held_out_split)
-    record = _record(prepared, profile, "recipes", num_steps=num_steps, batch_size=profile.batch_size)
-
-    def train_and_ask(row: Mapping) -> dict:
-        recipe = RECIPES[row["recipe"]]
-        config = recipe.config(num_steps, profile.batch_size, profile.seed)
-        folder = runs_dir(profile.dataset, profile.name) / "recipes" / recipe.name
-        how = {"config": config, "network": recipe.network, "folder": folder}
-        trained, _ = train(prepared, profile, preset=recipe.preset, **how)
-        rows = denoising.window_row(trained, held_out, seed=profile.seed)
-        named = {"recipe": recipe.name, "change": recipe.change, "weights": weights_digest(trained.params)}
-        return {"recipes": rows.assign(**named)}
-
-    return _measure(profile, record, ["recipes"], [{"recipe": name} for name in RECIPES], train_and_ask, again=None)
-
-
 DISTILLED, BY_DDIM = ", distilled", ", by DDIM"
 """Added to the name of a network in rows of its students of few steps, and of the walk that they learned."""
 
@@ -515,7 +482,7 @@ MEASUREMENTS: dict[str, Callable] = {
     measure.__name__.removeprefix("measure_"): measure
     for measure in (
         measure_noise_use,
-        measure_gradient_norm, measure_recipes, measure_quality, measure_walking,
+        measure_gradient_norm, measure_quality, measure_walking,
         measure_feet, measure_trained, measure_foot_spectrum, measure_sensitivity, measure_one_step,
         measure_round_times,
     )

@@ -42,7 +42,7 @@ log = logging.getLogger("f3amd")
 CAMPAIGN, TRAIN = "campaign", "train"
 """Legs that are no measurement of `measure`: a snapshot of the queue, and the training of a preset."""
 
-NOT_BY_PRESET = ("recipes", "sensitivity")
+NOT_BY_PRESET = ("sensitivity",)
 """Measurements whose table is not one of trained presets side by side."""
 
 CONNECT_S = 10

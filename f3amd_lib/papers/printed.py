@@ -19,7 +19,7 @@ a column of another name) and, where it was repeated, `low` and `high`."""
 TIMES = ("synthesis_time", "training_time")
 """Those of them that hang on the device."""
 
-_VALUES = {"x0_by_sigma": "x0_error", "recipes": "joint_error_cm"}
+_VALUES = {"x0_by_sigma": "x0_error"}
 
 NINE_METRICS = {
     row.metric: (row.unit, row.better)
