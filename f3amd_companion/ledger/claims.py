@@ -436,13 +436,13 @@ def changed_verdicts(frame: pd.DataFrame, accepted: Mapping[str, Mapping[str, st
       frame: from `ledger`.
       accepted: from `accepted_verdicts`.
     """
-    changes, verdicts = [], _verdicts(frame)
-    for name, now in verdicts.items():
-        for whose, side in (("our records", ""), ("the paper's tables", "paper_")):
-            was, verdict = accepted.get(name, {}).get(f"{side}verdict"), now[f"{side}verdict"]
-            if was != verdict:
-                before = repr(was) if was else "not accepted yet"
-                changes.append(f"{name} by {whose}: was {before}, is {verdict!r} ({now[f'{side}figure']})")
+    verdicts, sides = _verdicts(frame), {"our records": "", "the paper's tables": "paper_"}
+    changes = [
+        f"{name} by {whose}: was {was!r}, is {now[f'{side}verdict']!r} ({now[f'{side}figure']})"
+        for name, now in verdicts.items()
+        for whose, side in sides.items()
+        if (was := accepted.get(name, {}).get(f"{side}verdict", "not accepted yet")) != now[f"{side}verdict"]
+    ]
     return changes + [f"{name}: is no claim any more" for name in accepted if name not in verdicts]
 
 

@@ -19,6 +19,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import indent
 
 import pandas as pd
 
@@ -194,15 +195,10 @@ def notebook_sections(path) -> list[Section]:
     What stands before the first of them is the title page and in no section; deeper headings stay in the section
     they stand in.
     """
-    sections: list[Section] = []
-    for cell in _cells(path):
-        source, code = "".join(cell["source"]), cell["cell_type"] == "code"
-        before, *parts = [source] if code else re.split(r"^## (.*)$", source, flags=re.M)
-        if sections:
-            sections[-1].text += f"\n\n{before}"
-        for heading, text in zip(parts[::2], parts[1::2], strict=True):
-            sections.append(Section(heading.strip(), f"{heading}\n\n{text}"))
-    return sections
+    # Code is indented, so that no comment in it begins as a heading does.
+    told = (indent("".join(cell["source"]), "    " * (cell["cell_type"] == "code")) for cell in _cells(path))
+    _, *parts = re.split(r"^## (.*)$", "\n\n".join(told), flags=re.M)
+    return [Section(one.strip(), f"{one}\n\n{text}") for one, text in zip(parts[::2], parts[1::2], strict=True)]
 
 
 def _cells(path) -> list[dict]:

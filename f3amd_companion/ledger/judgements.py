@@ -66,9 +66,6 @@ GRADED = 0.05
 LEAST_METRICS = 5
 """Of the nine of Table 3, so many must be there before "every metric" means something."""
 
-EVERYTHING = (0.0, np.inf)
-
-
 # ------------------------------------------------------------------------------ verdicts and ranges
 
 
@@ -278,7 +275,7 @@ def _timed(evidence: Evidence, models: Mapping, device: str, characters) -> list
 
 
 def speedup(
-    evidence: Evidence, slow, fast, device, characters, bounds=EVERYTHING, gain=True, unit="x", text="{}",
+    evidence: Evidence, slow, fast, device, characters, bounds=(0.0, np.inf), gain=True, unit="x", text="{}",
     some=False, mean=False,
 ) -> Finding:  # fmt: skip
     """Judge how many times as fast one model, or each of a family, is at some numbers of characters.

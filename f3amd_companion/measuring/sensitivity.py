@@ -214,26 +214,22 @@ def foot_spectrum(systems: Mapping[tuple[str, int, int], Sequence[tuple[str, Mot
 
     Source: paper section 6 ("may lose fine foot motion" of FNO variants); the measure is ours.
     """
-    power = {}
+    rows, keys = [], ["model", "window_frames", "steps"]
     for key, pairs in systems.items():
-        powers = [{"style": style, **_toe_power(motion)} for style, motion in pairs if motion.num_frames > _SEGMENT]
-        if not powers:
+        long = [(style, motion) for style, motion in pairs if motion.num_frames > _SEGMENT]
+        if not long:
             raise ValueError(f"{key[0]}: no motion of more than {_SEGMENT} frames")
-        power[key] = pd.DataFrame(powers).groupby("style", sort=False).mean()
-    real = next(table for key, table in power.items() if key[0] == "real")
-    rows = []
-    for key, table in power.items():
-        lacking = [style for style in table.index if style not in real.index]
-        if lacking:
-            raise ValueError(f"no real clip of style {lacking[0]!r} is long enough to compare with")
-        named = dict(zip(("model", "window_frames", "steps"), key, strict=True))
-        quotient = np.log(table / real.loc[table.index])
-        for band in FOOT_BANDS:
-            absolute = distributions.mean_and_interval(table[band].to_numpy())
-            ratio = distributions.mean_and_interval(quotient[band].to_numpy())
-            ratio |= {bound: float(np.exp(ratio[bound])) for bound in ("value", "low", "high")}
-            rows += [
-                {**named, "band": band, "metric": "toe_power", **absolute},
-                {**named, "band": band, "metric": "toe_power_over_real", **ratio},
-            ]
-    return pd.DataFrame(rows)
+        rows += [(*key, style, *each) for style, motion in long for each in _toe_power(motion).items()]
+    power = pd.DataFrame(rows, columns=[*keys, "style", "band", "value"])
+    power = power.groupby([*keys, "style", "band"], sort=False)["value"].mean().reset_index()
+    real = power[power["model"] == "real"].set_index(["style", "band"])["value"].rename("real")
+    power = power.join(real, on=["style", "band"])
+    for style in power.loc[power["real"].isna(), "style"]:
+        raise ValueError(f"no real clip of style {style!r} is long enough to compare with")
+    quotient = power.assign(value=np.log(power["value"] / power["real"]))
+    tables = {"toe_power": power, "toe_power_over_real": quotient}
+    tables = {name: distributions.intervals_over_repeats(one, [*keys, "band"]) for name, one in tables.items()}
+    bounds = ["value", "low", "high"]
+    tables["toe_power_over_real"][bounds] = np.exp(tables["toe_power_over_real"][bounds])
+    table = pd.concat([one.assign(metric=name) for name, one in tables.items()], ignore_index=True)
+    return table[[*keys, "band", "metric", *bounds, "repeats"]]
