@@ -762,13 +762,9 @@ def campaign(
                 return UNFINISHED
         if stop_at is not None and time.monotonic() >= stop_at:  # a style classifier may have to be trained
             return UNFINISHED
-        if package is not None and not measure:
-            legs = long_queue.train_snapshots(prepared, profile, folder=folder, **how)
-        else:
-            judges = protocol_of(prepared, profile, "campaign")[:2]
-            how |= {"folder": folder, "table": table, "found_alone": measure}
-            legs = long_queue.run_campaign(prepared, profile, *judges, **how)
-        for name, windows, state in legs:
+        judges = () if package is not None and not measure else protocol_of(prepared, profile, "campaign")[:2]
+        how |= {"folder": folder, "table": table, "found_alone": measure}
+        for name, windows, state in long_queue.run_campaign(prepared, profile, *judges, **how):
             log.info("%-12s %s, %s windows", state, name, f"{windows:,}")
     return UNFINISHED if state == "unfinished" else 0
 

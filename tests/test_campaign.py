@@ -13,7 +13,7 @@ from builders import refused, walks_of
 
 from f3amd_companion.__main__ import UNFINISHED, main
 from f3amd_companion.measuring import campaign, measure
-from f3amd_companion.measuring.campaign import Run, chosen, longest_first, queue, run_campaign, train_snapshots
+from f3amd_companion.measuring.campaign import Run, chosen, longest_first, queue, run_campaign
 from f3amd_companion.speed import measurements
 from f3amd_companion.speed.measurements import Candidate
 from f3amd_lib.data.packed import save_packed
@@ -95,7 +95,9 @@ def test_a_recipe_with_a_batch_of_its_own_sees_as_many_windows_in_other_steps(pa
     prepared = PreparedData(packed, 32, 10)
     how = {"batch_size": 128, "folder": tmp_path, "progress": False}
     for each in (run, Run("F3AMD-FNO-96")):
-        assert list(train_snapshots(prepared, PROFILE, [(each, 10_240)], **how)) == [(each.name, 10_240, "unfinished")]
+        assert list(run_campaign(prepared, PROFILE, snapshots=[(each, 10_240)], **how)) == [
+            (each.name, 10_240, "unfinished")
+        ]
     assert [(config.batch_size, steps) for config, steps in seen] == [(512, 20), (128, 80)]
 
 
@@ -110,7 +112,7 @@ def test_training_multiplies_in_the_precision_asked_for(packed, monkeypatch, tmp
     monkeypatch.setattr(campaign, "train_in_legs", look)
     monkeypatch.setattr(campaign, "check_precision", lambda precision: None)  # as on a GPU
     how = {"snapshots": [(SEEDED, 10_240)], "folder": tmp_path, "precision": precision}
-    assert [state for *_, state in train_snapshots(PreparedData(packed, 32, 10), PROFILE, **how)] == ["unfinished"]
+    assert [state for *_, state in run_campaign(PreparedData(packed, 32, 10), PROFILE, **how)] == ["unfinished"]
     assert seen == [products] and jax.config.jax_default_matmul_precision != products
 
 

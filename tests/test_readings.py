@@ -8,7 +8,7 @@ from builders import CHANNELS, SKELETON, random_frames
 from test_campaign import PROFILE, STYLES, judges, packed, small  # noqa: F401  (fixtures)
 
 from f3amd_companion.measuring import campaign, fingerprint
-from f3amd_companion.measuring.campaign import Run, find_recipe, queue, run_campaign, train_snapshots
+from f3amd_companion.measuring.campaign import Run, find_recipe, queue, run_campaign
 from f3amd_lib.data.windows import spread_windows
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.motion.root_paths import named_path
@@ -123,7 +123,7 @@ def test_a_package_keeps_weights_that_are_measured_elsewhere(packed, judges, sma
     monkeypatch.setattr(fingerprint, "NUM_FRAMES", 66)
     snapshots = [(Run("F3AMD-FNO-32", length=1), 8), (Run("F3AMD-FNO-32", seed=1), 8)]
     how = {"folder": tmp_path, "batch_size": 4, "progress": False}
-    states = list(train_snapshots(PreparedData(packed, 32, 10), PROFILE, snapshots[:1], **how))
+    states = list(run_campaign(PreparedData(packed, 32, 10), PROFILE, snapshots=snapshots[:1], **how))
     assert states == [("F3AMD-FNO-32-1k-seed0", 8, "kept")]
     how |= {"snapshots": snapshots, "table": "readings", "found_alone": True}
     states = list(run_campaign(PreparedData(packed, 32, 10), PROFILE, *judges, **how))

@@ -24,7 +24,7 @@ import itertools
 import logging
 import time
 from collections import ChainMap
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -255,16 +255,18 @@ def check_precision(precision: str) -> None:
 
 
 def run_campaign(
-    prepared: PreparedData, profile: Profile, classifier: StyleClassifier, protocol: Protocol, *, folder,
-    snapshots: Iterable[tuple[Run, int]], batch_size: int = 128, precision: str = "float32",
-    stop_at: float | None = None, known: Path | None = None, table: str = "campaign", found_alone: bool = False,
-    progress: bool = True,
+    prepared: PreparedData, profile: Profile, classifier: StyleClassifier | None = None,
+    protocol: Protocol | None = None, *, folder, snapshots: Iterable[tuple[Run, int]], batch_size: int = 128,
+    precision: str = "float32", stop_at: float | None = None, known: Path | None = None, table: str = "campaign",
+    found_alone: bool = False, progress: bool = True,
 ) -> Iterator[tuple[str, int, str]]:  # fmt: skip
     """Train and measure snapshots that are not on record, until all are or the time is over.
 
     Args:
       prepared, profile: the data, and where records go.
-      classifier, protocol: of the measurement (`protocol.measure_model`), of which one seed is taken.
+      classifier, protocol: of the measurement (`protocol.measure_model`), of which one seed is taken. Without them
+        weights are kept and measured where there is time, for a GPU that is at hand for minutes: programs of all runs
+        are compiled side by side before the first one trains, if JAX keeps a cache of them.
       folder: where training states and weights lie, a folder a run.
       snapshots: of `queue`, in the order in which they are trained.
       batch_size: windows a step, but for a recipe that has its own (the paper's is 512, for a GPU).
@@ -276,82 +278,51 @@ def run_campaign(
       progress: show progress bars.
 
     Yields:
-      (run, windows, state) for each snapshot: "measured before", "measured", "not there" of weights that are not
-      found, or "unfinished", which is the last.
+      (run, windows, state) for each snapshot: "measured before", "measured", "kept before" or "kept" of weights that
+      are not measured, "not there" of weights that are not found, or "unfinished", which is the last.
     """
     check_precision(precision)
-    protocol = replace(protocol, num_seeds=1)
+    snapshots, measured = list(snapshots), classifier is not None
+    protocol = replace(protocol, num_seeds=1) if measured else None
+    seed, about = (protocol.path_seed, {"protocol": asdict(protocol)}) if measured else (0, {})
     record = run_record(
-        profile=profile, dataset=prepared.packed, seed=protocol.path_seed, measurement=table,
-        batch_size=batch_size, protocol=asdict(protocol),
+        profile=profile, dataset=prepared.packed, seed=seed, measurement=table if measured else "package",
+        batch_size=batch_size, **about,
     )  # fmt: skip
-    records = Records(records_folder(profile), record, {table: ["run", "windows"]}, known=known)
-    if table == "readings" and not records.has(table, {"run": "real", "windows": 0}):
-        clips, _ = held_out_clips(prepared.packed, prepared.packed.styles, prepared.window)
-        real = real_rows(prepared.packed, clips, window=prepared.window)
-        records.put(table, {"run": "real", "windows": 0}, real.assign(model="real", weights=""))
     how = {"batch_size": batch_size, "precision": precision, "record": record, "folder": folder}
     how |= {"stop_at": stop_at, "progress": progress}
+    if measured:
+        records = Records(records_folder(profile), record, {table: ["run", "windows"]}, known=known)
+        if table == "readings" and not records.has(table, {"run": "real", "windows": 0}):
+            clips, _ = held_out_clips(prepared.packed, prepared.packed.styles, prepared.window)
+            real = real_rows(prepared.packed, clips, window=prepared.window)
+            records.put(table, {"run": "real", "windows": 0}, real.assign(model="real", weights=""))
+    elif jax.config.jax_compilation_cache_dir:
 
-    def measure(run: Run, windows: int) -> str:
-        if records.has(table, key := {"run": run.name, "windows": windows}):
-            return "measured before"
-        if found_alone and not _weights(folder, run, windows).exists():
-            return "not there"
-        if stop_at is not None and time.monotonic() >= stop_at:
-            return "unfinished"
-        if (rows := _measured(prepared, classifier, protocol, run, windows, table, **how)) is None:
-            return "unfinished"
-        records.put(table, key, rows)
-        return "measured"
+        def compiled(run: Run) -> None:
+            with matmul_precision(precision):
+                compile_steps(_laid_out(prepared, run, batch_size)[1], 50)
 
-    return _in_turn(snapshots, measure)
-
-
-def _in_turn(snapshots: Iterable[tuple[Run, int]], do: Callable[[Run, int], str]) -> Iterator[tuple[str, int, str]]:
-    """Yield (run, windows, state) as each snapshot is done, up to the first that is "unfinished"."""
-    for run, windows in snapshots:
-        yield run.name, windows, (state := do(run, windows))
-        if state == "unfinished":
-            return
-
-
-def train_snapshots(
-    prepared: PreparedData, profile: Profile, snapshots: Iterable[tuple[Run, int]], *, folder, batch_size: int = 128,
-    precision: str = "float32", stop_at: float | None = None, progress: bool = True,
-) -> Iterator[tuple[str, int, str]]:  # fmt: skip
-    """Train snapshots and keep their weights, for a GPU that is at hand for minutes: measured where there is time.
-
-    The programs of all runs are compiled side by side before the first one trains, if JAX keeps a cache of them.
-
-    Args:
-      prepared, profile, snapshots, folder, batch_size, precision, stop_at, progress: as for `run_campaign`.
-
-    Yields:
-      (run, windows, state), state "kept", "kept before", or "unfinished", which is the last.
-    """
-    check_precision(precision)
-    snapshots = list(snapshots)
-    record = run_record(profile=profile, dataset=prepared.packed, seed=0, measurement="package", batch_size=batch_size)
-
-    def compiled(run: Run) -> None:
-        with matmul_precision(precision):
-            compile_steps(_laid_out(prepared, run, batch_size)[1], 50)
-
-    if jax.config.jax_compilation_cache_dir:
         with ThreadPoolExecutor() as pool:
             list(pool.map(compiled, dict.fromkeys(run for run, _ in snapshots)))
-
-    def keep(run: Run, windows: int) -> str:
-        if _weights(folder, run, windows).exists():
-            return "kept before"
-        done = _trained(
-            prepared, run, windows, batch_size=batch_size, precision=precision, record=record, folder=folder,
-            stop_at=stop_at, progress=progress,
-        )  # fmt: skip
-        return "unfinished" if done is None else "kept"
-
-    return _in_turn(snapshots, keep)
+    for run, windows in snapshots:
+        key, there, state = {"run": run.name, "windows": windows}, _weights(folder, run, windows).exists(), "unfinished"
+        if measured and records.has(table, key):
+            state = "measured before"
+        elif there and not measured:
+            state = "kept before"
+        elif found_alone and not there:
+            state = "not there"
+        elif stop_at is not None and time.monotonic() >= stop_at:
+            pass
+        elif not measured:
+            state = "unfinished" if _trained(prepared, run, windows, **how) is None else "kept"
+        elif (rows := _measured(prepared, classifier, protocol, run, windows, table, **how)) is not None:
+            records.put(table, key, rows)
+            state = "measured"
+        yield run.name, windows, state
+        if state == "unfinished":
+            return
 
 
 def _laid_out(prepared: PreparedData, run: Run, batch_size: int) -> tuple[PreparedData, DenoisingTask]:
