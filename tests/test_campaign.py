@@ -250,8 +250,7 @@ def minutes(packed, monkeypatch, tmp_path):
     def time_group(candidates, *_, **__):
         (one,) = candidates
         work(f"{one.characters} characters")
-        named = dict(zip(measurements.CANDIDATE_COLUMNS, dataclasses.astuple(one), strict=True))
-        return pd.DataFrame([named | {"framework": "jax", "device": "CPU", "value": 1.0}]), {}
+        return pd.DataFrame([dataclasses.asdict(one) | {"framework": "jax", "device": "CPU", "value": 1.0}]), {}
 
     def measured(prepared, classifier, protocol, run, windows, *_, **__):
         work(f"{run.name} {windows}")

@@ -51,9 +51,9 @@ def tables(run: str) -> dict[str, list[dict]]:
             figure
             | {
                 "model": one.model,
-                "window_frames": one.window,
+                "window_frames": one.window_frames,
                 "steps": one.steps,
-                "framework": implementations.IMPLEMENTATIONS[one.implementation][0],
+                "framework": implementations.IMPLEMENTATIONS[one.way][0],
                 "device": "GPU" if what == "gpu" else "CPU",
                 "characters": one.characters,
             }

@@ -98,7 +98,7 @@ def test_plans_name_presets_and_implementations_that_exist_each_once():
         assert members and len(members) == len(set(members))
         for candidate in members:
             assert presets.find_preset(candidate.model).name == candidate.model
-            assert candidate.implementation in implementations.IMPLEMENTATIONS
+            assert candidate.way in implementations.IMPLEMENTATIONS
     refused("unknown suite", check_suites, ["bar"])
 
 

@@ -68,8 +68,6 @@ STEPS_MEASURED = (8, 1)
 _EVERY = {"CPU": 400}
 """Steps between checkpoints, and looks at the held-out loss, by device: on a GPU 1,000, which takes it seconds."""
 
-_PRECISIONS = ("float32", "tf32")
-
 _QUEUES = Path(f3amd_lib.__file__).parent / "papers" / "f3amd"
 QUEUES = {"campaign": _QUEUES / "campaign.toml", "readings": _QUEUES / "readings_queue.toml"}
 """Table of records -> its queue."""
@@ -108,11 +106,8 @@ class Recipe:
         """
         settings = {"batch_size": batch_size, "seed": seed, "loss": self.loss, **self.training}
         num_steps = max(1, num_steps * batch_size // settings["batch_size"])
-        tenth = max(1, num_steps // 10)
-        if settings.get("schedule") == "warmup_cosine":
-            settings["warmup_steps"] = tenth
-        if settings.get("schedule") == "warmup_inverse_square":
-            settings["warmup_steps"] = min(200, tenth)
+        if most := {"warmup_cosine": num_steps, "warmup_inverse_square": 200}.get(settings.get("schedule")):
+            settings["warmup_steps"] = min(most, max(1, num_steps // 10))
         return paper_recipe(self.preset, num_steps, **settings)
 
     def on(self, preset: str) -> Recipe:
@@ -249,7 +244,7 @@ def longest_first(snapshots: Iterable[tuple[Run, int]]) -> list[tuple[Run, int]]
 
 def check_precision(precision: str) -> None:
     """Raise ValueError for a precision of training that is unknown, or that this device does not have."""
-    check_known(precision, _PRECISIONS, "precision of training")
+    check_known(precision, ("float32", "tf32"), "precision of training")
     if precision == "tf32" and device_name() == "CPU":
         raise ValueError("tf32 is for a GPU: on this CPU products are float32, leave --precision out")
 

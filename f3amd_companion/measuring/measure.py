@@ -87,11 +87,6 @@ def _styles(prepared: PreparedData, profile: Profile) -> list[str]:
     return list(profile.evaluation_styles or prepared.packed.primary_styles[: profile.num_characters])
 
 
-def _refuse_models(models: Iterable[str] | None, reason: str) -> None:
-    if models:
-        raise ValueError(f"{reason}: leave --model out")
-
-
 def models_with_weights(profile: Profile, option: str = "--model") -> list[str]:
     """List the presets that have weights; ValueError, with what to do (name one with `option`), if there are none."""
     if names := available_models(profile):
@@ -335,7 +330,8 @@ def measure_sensitivity(prepared: PreparedData, profile: Profile, models: Iterab
     Raises:
       ValueError: if models are named.
     """
-    _refuse_models(models, "the metrics are asked about real motion")
+    if models:
+        raise ValueError("the metrics are asked about real motion: leave --model out")
     classifier, protocol, record = protocol_of(prepared, profile, "sensitivity")
     graded = sensitivity.graded_corruptions(prepared.packed, classifier, protocol, progress=True)
     folder = records_folder(profile)

@@ -79,27 +79,23 @@ def _circumstances() -> dict:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A row of the table before it is timed: a model, how it is used, and in which implementation."""
+    """A row of the table before it is timed, by its columns: a model, how it is used, and in which implementation."""
 
     model: str
     steps: int
     characters: int
-    implementation: str
-    window: int = 32
+    way: str
+    window_frames: int = 32
     precision: str = "float32"
 
     def __str__(self) -> str:
-        characters = f"{self.characters} character{'s' if self.characters > 1 else ''}, {self.window} frames"
-        return f"{row_label(self.model, self.steps)}, {characters}, {self.implementation}, {self.precision}"
+        characters = f"{self.characters} character{'s' if self.characters > 1 else ''}, {self.window_frames} frames"
+        return f"{row_label(self.model, self.steps)}, {characters}, {self.way}, {self.precision}"
 
     @property
     def group(self) -> tuple[int, int, str]:
         """What a candidate shares with those that it is timed by turns with."""
-        return self.window, self.characters, self.precision
-
-
-CANDIDATE_COLUMNS = ["model", "steps", "characters", "way", "window_frames", "precision"]
-"""Columns of a table that name the candidate of a row, in the order of its fields."""
+        return self.window_frames, self.characters, self.precision
 
 
 def check_suites(names: Iterable[str]) -> list[str]:
@@ -113,7 +109,7 @@ def plan(suite: str) -> dict[tuple, list[Candidate]]:
     """Return what a suite of `SUITES` times, by group, each candidate once."""
     groups: dict[tuple, dict[Candidate, None]] = {}
     for block in SUITES[suite]:
-        unusual = {key: block[key] for key in ("window", "precision") if key in block}
+        unusual = {key: block[key] for key in ("window_frames", "precision") if key in block}
         for implementation, counts in block["characters"].items():
             for characters, model, steps in itertools.product(counts, block["models"], block["steps"]):
                 candidate = Candidate(model, steps, characters, implementation, **unusual)
@@ -143,10 +139,10 @@ def time_group(
     def prepare(candidate: Candidate) -> tuple[Workload, implementations.Round]:
         config = build_config(candidate.model, window)
         workload = Workload(candidate.model, config, candidate.steps, characters, precision)
-        return workload, implementations.prepare_round(candidate.implementation, workload)
+        return workload, implementations.prepare_round(candidate.way, workload)
 
     # PyTorch's compiler is not made for threads.
-    prepared = prepared_at_once(prepare, [one for one in candidates if one.implementation.startswith("jit")])
+    prepared = prepared_at_once(prepare, [one for one in candidates if one.way.startswith("jit")])
     ready, failed = {}, {}
     with tqdm(candidates, unit="compiled", disable=not progress) as bar:
         for candidate in bar:
@@ -155,7 +151,7 @@ def time_group(
                 ready[candidate] = prepared[candidate]() if candidate in prepared else prepare(candidate)
             except implementations.NotPossible as reason:
                 failed[str(candidate)] = str(reason)
-    frameworks = {candidate: implementations.IMPLEMENTATIONS[candidate.implementation][0] for candidate in ready}
+    frameworks = {candidate: implementations.IMPLEMENTATIONS[candidate.way][0] for candidate in ready}
     yardsticks = {candidate: "torch" if framework == "torch" else "jax" for candidate, framework in frameworks.items()}
     probes = {name: implementations.framework_probe(name, precision) for name in dict.fromkeys(yardsticks.values())}
     calls = {candidate: done.call for candidate, (_, done) in ready.items()}
@@ -164,10 +160,8 @@ def time_group(
     for candidate, (workload, done) in ready.items():
         timing, yardstick, flops = timings[candidate], yardsticks[candidate], implementations.round_flops(workload)
         reached, peak = flops / timing.median / 1e9, probes[yardstick][1] / timings[yardstick].median / 1e9
-        row = {"model": candidate.model, "window_frames": window, "steps": candidate.steps}
-        row |= {"sampler": workload.sampler, "framework": frameworks[candidate], "way": candidate.implementation}
-        row |= {"device": device_name(), "precision": precision, "characters": characters}
-        row |= timing.columns("ms", 1e3) | {"compile_seconds": round(done.compile_seconds, 2)}
+        row = dataclasses.asdict(candidate) | {"sampler": workload.sampler, "framework": frameworks[candidate]}
+        row |= {"device": device_name(), "compile_seconds": round(done.compile_seconds, 2)} | timing.columns("ms", 1e3)
         row |= {"flops": flops, "gflops": reached, "peak_gflops": peak, "share_of_peak": reached / peak}
         rows.append(row)
     return pd.DataFrame(rows), failed
@@ -198,14 +192,15 @@ def measure_synthesis_time(
     suites = check_suites(suites or DEFAULT_SUITES[profile.name])
     turns = {"fewest_rounds": 3, **_TURNS.get(profile.name, {})}
     record = _record(prepared, profile, "synthesis_time", turns=turns)
-    keys, summaries = ["suite", *CANDIDATE_COLUMNS], {"synthesis_time": ("synthesis_ways", fastest_implementations)}
+    keys = ["suite", *(field.name for field in dataclasses.fields(Candidate))]
+    summaries = {"synthesis_time": ("synthesis_ways", fastest_implementations)}
     records = Records(records_folder(profile), record, {"synthesis_ways": keys}, summaries=summaries)
     path, fastest = map(records.path, ("synthesis_ways", "synthesis_time"))
     failed = {} if records.tables["synthesis_ways"] is None else read_table(path)[1].get("not_possible", {})
 
     def is_done(suite: str, candidate: Candidate) -> bool:
-        named = dict(zip(keys, (suite, *dataclasses.astuple(candidate)), strict=True))
-        return not again and (str(candidate) in failed or records.has("synthesis_ways", named))
+        row = {"suite": suite} | dataclasses.asdict(candidate)
+        return not again and (str(candidate) in failed or records.has("synthesis_ways", row))
 
     todo = [
         (suite, candidates)
