@@ -361,7 +361,8 @@ def measure_foot_spectrum(prepared: PreparedData, profile: Profile, models: Iter
             ]
         return {"foot_spectrum": sensitivity.foot_spectrum(walks).query("model == @row['model']")}
 
-    record = _record(prepared, profile, "foot_spectrum", num_frames=num_frames, styles=styles)
+    settings = {"num_frames": num_frames, "styles": styles, "steps": profile.num_steps}
+    record = _record(prepared, profile, "foot_spectrum", **settings)
     todo = _rows_of(profile, [("real", 0), *((name, profile.num_steps) for name in trained)])
     return _measure(profile, record, ["foot_spectrum"], todo, listen, again=models, trained=trained)
 
@@ -412,7 +413,7 @@ def measure_gradient_norm(prepared: PreparedData, profile: Profile, models: Iter
         levels = denoising.gradient_norm_by_sigma(task, model.params, held_out, SIGMAS, seed=profile.seed)
         return {"gradient_norm": levels}
 
-    record, todo = _record(prepared, profile, "gradient_norm"), [{"model": name} for name in trained]
+    record, todo = _record(prepared, profile, "gradient_norm", sigmas=SIGMAS), [{"model": name} for name in trained]
     return _measure(profile, record, ["gradient_norm"], todo, slope, again=models, trained=trained)
 
 
@@ -469,7 +470,8 @@ def measure_round_times(prepared: PreparedData, profile: Profile, models: Iterab
     called = {"value": "milliseconds", "median_low": "milliseconds_low", "median_high": "milliseconds_high"}
     keys = ["model", "steps", "characters"]
     table = times[[*keys, *called]].rename(columns=called).assign(weights=times["model"].map(_digests(trained)))
-    records = Records(records_folder(profile), _record(prepared, profile, "round_times"), {"round_times": keys})
+    record = _record(prepared, profile, "round_times", characters=_TIMED_CHARACTERS)
+    records = Records(records_folder(profile), record, {"round_times": keys})
     records.put("round_times", {}, table)
     return records.path("round_times")
 
