@@ -25,7 +25,6 @@ import logging
 import time
 from collections import ChainMap
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -37,7 +36,7 @@ import pandas as pd
 import f3amd_lib
 from f3amd_companion.measuring.fingerprint import real_rows, walk_rows, window_rows
 from f3amd_companion.measuring.runner import Records, records_folder
-from f3amd_companion.speed.machine import device_name, matmul_precision
+from f3amd_companion.speed.machine import device_name, matmul_precision, prepared_at_once
 from f3amd_lib.data.windows import WindowSet
 from f3amd_lib.ground.files import read_toml
 from f3amd_lib.ground.names import check_known
@@ -261,7 +260,7 @@ def run_campaign(
       prepared, profile: the data, and where records go.
       classifier, protocol: of the measurement (`protocol.measure_model`), of which one seed is taken. Without them
         weights are kept and measured where there is time, for a GPU that is at hand for minutes: programs of all runs
-        are compiled side by side before the first one trains, if JAX keeps a cache of them.
+        are compiled before the first one trains, on a GPU side by side, if JAX keeps a cache of them.
       folder: where training states and weights lie, a folder a run.
       snapshots: of `queue`, in the order in which they are trained.
       batch_size: windows a step, but for a recipe that has its own (the paper's is 512, for a GPU).
@@ -298,8 +297,8 @@ def run_campaign(
             with matmul_precision(precision):
                 compile_steps(_laid_out(prepared, run, batch_size)[1], 50)
 
-        with ThreadPoolExecutor() as pool:
-            list(pool.map(compiled, dict.fromkeys(run for run, _ in snapshots)))
+        for program in prepared_at_once(compiled, dict.fromkeys(run for run, _ in snapshots)).values():
+            program()
     for run, windows in snapshots:
         key, there, state = {"run": run.name, "windows": windows}, _weights(folder, run, windows).exists(), "unfinished"
         if measured and records.has(table, key):
