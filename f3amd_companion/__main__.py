@@ -645,7 +645,8 @@ def bench(
       parts: time a round without each part.
     """
     _use_fast_flags()
-    from f3amd_companion.speed import measurements, speed_tables
+    from f3amd_companion.measuring import times as measurements
+    from f3amd_companion.speed import speed_tables
     from f3amd_lib.ground.records import read_table
     from f3amd_lib.ground.tables import markdown_table
 
@@ -738,7 +739,7 @@ def campaign(
         _use_fast_flags()
     from f3amd_companion.measuring import campaign as long_queue
     from f3amd_companion.measuring.measure import protocol_of
-    from f3amd_companion.speed.measurements import measure_synthesis_time, measure_training_time
+    from f3amd_companion.measuring.times import measure_synthesis_time, measure_training_time
     from f3amd_lib.data.packed import load_packed
     from f3amd_lib.training.pipeline import PreparedData
 

@@ -13,9 +13,9 @@ from builders import refused, walks_of
 
 from f3amd_companion.__main__ import UNFINISHED, main
 from f3amd_companion.measuring import campaign, measure
+from f3amd_companion.measuring import times as measurements
 from f3amd_companion.measuring.campaign import Run, chosen, longest_first, queue, run_campaign
-from f3amd_companion.speed import measurements
-from f3amd_companion.speed.measurements import Candidate
+from f3amd_companion.measuring.times import Candidate
 from f3amd_lib.data.packed import save_packed
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import read_table

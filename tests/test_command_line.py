@@ -17,10 +17,11 @@ from strangers import bvh_cases
 from tqdm import tqdm
 
 from f3amd_companion.__main__ import COMMANDS, main
+from f3amd_companion.measuring import times as measurements
 from f3amd_companion.serving import motion_files
 from f3amd_companion.serving.crowd import read_crowd
 from f3amd_companion.serving.crowd_planning import MIN_DISTANCE, closest_approach
-from f3amd_companion.speed import machine, measurements, speed_tables
+from f3amd_companion.speed import machine, speed_tables
 from f3amd_companion.terminal import Lines
 from f3amd_lib.motion.bvh import read_bvh
 from f3amd_lib.training.checkpoints import save_model

@@ -11,9 +11,10 @@ from f3amd_companion.ledger import claims
 from f3amd_companion.ledger.evidence import recorded_evidence, snapshot_evidence
 from f3amd_companion.ledger.judgements import UNJUDGED, UNMEASURED
 from f3amd_companion.measuring import campaign, measure, sensitivity
+from f3amd_companion.measuring import times as measurements
 from f3amd_companion.measuring.sensitivity import FOOT_BANDS, STRENGTHS
 from f3amd_companion.measuring.text_tables import TABLES, TEXT_MEASUREMENTS
-from f3amd_companion.speed import implementations, measurements
+from f3amd_companion.speed import implementations
 from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.ground.profiles import load_profile

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from builders import CHANNELS, WINDOW, network_of, refused, tiny_camdm, tiny_config
 
+from f3amd_companion.measuring.times import PARTS, SUITES, Candidate, check_suites, plan, time_group
 from f3amd_companion.speed import implementations
 from f3amd_companion.speed.implementations import NotPossible, Workload, prepare_round, random_condition
-from f3amd_companion.speed.measurements import PARTS, SUITES, Candidate, check_suites, plan, time_group
 from f3amd_lib.diffusion.samplers import num_evaluations
 from f3amd_lib.networks import presets
 from f3amd_lib.networks.conditioning import Condition

@@ -29,8 +29,8 @@ from f3amd_companion.measuring.consistency_task import STUDENT_SPACING, TEACHER_
 from f3amd_companion.measuring.published import NAME as PUBLISHED
 from f3amd_companion.measuring.published import published_model
 from f3amd_companion.measuring.runner import Records, records_folder
+from f3amd_companion.measuring.times import Candidate, time_group
 from f3amd_companion.serving.foot_locking import lock_rollout, lock_rollout_online
-from f3amd_companion.speed.measurements import Candidate, time_group
 from f3amd_lib.data.packed import PackedMotion
 from f3amd_lib.ground.names import asked_network
 from f3amd_lib.ground.profiles import Profile, runs_dir
