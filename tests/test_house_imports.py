@@ -28,7 +28,7 @@ OF_THE_LIBRARY = ("01", "02", "03", "04", "11", "12", "13", "16", "17", "18", "1
 """Notebooks that import the library alone, as all of the course do; the others may import the companion."""
 
 FOREIGN = (
-    "papermill nbconvert nbformat nbclient ipykernel jupyterlab selenium dask distributed tyro pygltflib onnx "
+    "papermill nbconvert nbformat nbclient ipykernel jupyterlab selenium dask distributed tyro onnx "
     "onnxruntime jax2onnx iree torch transformers"
 ).split()
 """What runs notebooks, drives pages, serves or exports."""

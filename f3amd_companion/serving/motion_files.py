@@ -4,14 +4,15 @@ glTF has skeleton, skin and animation in one file, which engines and Blender ope
 mesh (`text.data.body`). Units are metres, +Y is up, and with yaw 0 it faces +Z: glTF's own conventions. Rotations are
 quaternions (x, y, z, w) without jumps of sign.
 
-Source: Khronos Group, glTF 2.0 specification, sections 3.6 (accessors), 3.7.3 (skins), 3.11 (animations).
+Source: Khronos Group, glTF 2.0 specification, sections 3.6 (accessors), 3.7.3 (skins), 3.11 (animations), 4.4 (chunks).
 """
 
+import json
+import struct
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
-import pygltflib as gltf
 from scipy.spatial.transform import Rotation
 
 from f3amd_lib.ground.files import named_file, write_whole
@@ -19,36 +20,31 @@ from f3amd_lib.motion.bvh import write_bvh
 from f3amd_lib.motion.skeleton import Motion
 from f3amd_lib.text.data.body import make_body
 
-_COMPONENTS = {"u1": gltf.UNSIGNED_BYTE, "u2": gltf.UNSIGNED_SHORT, "u4": gltf.UNSIGNED_INT, "f4": gltf.FLOAT}
-_KINDS = {(): gltf.SCALAR, (3,): gltf.VEC3, (4,): gltf.VEC4, (4, 4): gltf.MAT4}
+_COMPONENTS = {"u1": 5121, "u2": 5123, "u4": 5125, "f4": 5126}
+_KINDS = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
+_CORNERS, _FACES = {"target": 34962}, {"target": 34963}  # what a view is for: numbers of vertices, numbers of faces
 _GREY = [0.42, 0.47, 0.55, 1.0]
 
 
-def _append(items: list, item) -> int:
-    """Append an item, and return its place."""
-    items.append(item)
-    return len(items) - 1
-
-
 class _File:
-    """A glTF document and the bytes that its accessors point into."""
+    """Accessors of a glTF file, a view each, and the bytes that they point into."""
 
-    def __init__(self, credit: str):
-        self.document = gltf.GLTF2(asset=gltf.Asset(version="2.0", generator="f3amd_lib", copyright=credit or None))
-        self.bytes = b""
+    def __init__(self):
+        self.accessors, self.views, self.bytes = [], [], b""
 
-    def put(self, values: np.ndarray, dtype: str, target: int | None = None) -> int:
+    def put(self, values: np.ndarray, dtype: str, **use) -> int:
         """Store an array, [N, ...], and return its accessor."""
         values = np.ascontiguousarray(values, f"<{dtype}")
-        view = gltf.BufferView(buffer=0, byteOffset=len(self.bytes), byteLength=values.nbytes, target=target)
+        self.views.append({"buffer": 0, "byteOffset": len(self.bytes), "byteLength": values.nbytes, **use})
         flat = values.reshape(len(values), -1)
         bounds = {name: getattr(flat, name)(axis=0).tolist() for name in ("min", "max")}
         if values.ndim == 3:  # of matrices nobody asks for bounds
             bounds, values = {}, np.swapaxes(values, 1, 2)  # column by column
         self.bytes += values.tobytes() + bytes(-values.nbytes % 4)
-        about = {"componentType": _COMPONENTS[dtype], "count": len(values), "type": _KINDS[values.shape[1:]]}
-        accessor = gltf.Accessor(bufferView=_append(self.document.bufferViews, view), **about, **bounds)
-        return _append(self.document.accessors, accessor)
+        number, kind = len(self.accessors), _KINDS[values.shape[1:]]
+        about = {"bufferView": number, "componentType": _COMPONENTS[dtype], "count": len(values), "type": kind}
+        self.accessors.append(about | bounds)
+        return number
 
 
 def _quaternions(rotations) -> np.ndarray:
@@ -75,49 +71,46 @@ def write_glb(path, motion: Motion, *, credit: str = "", overwrite: bool = False
       ValueError: for a wrong suffix, a file that is there, or motion without rotations.
     """
     path = named_file(path, ".glb", "motions in binary glTF")
-    file = _File(credit)
-    document, skeleton, body = file.document, motion.skeleton, make_body(motion.skeleton)
+    file, skeleton, body = _File(), motion.skeleton, make_body(motion.skeleton)
     turns = _quaternions(np.asarray(motion.needed_rotations("a glTF animation"), np.float64))
     root = np.asarray(motion.root_position, np.float64)
     times = file.put(np.arange(motion.num_frames) / motion.fps, "f4")
-    for joint, name in enumerate(skeleton.names):
-        place = root[0] if joint == 0 else skeleton.offsets[joint]
-        turn, children = turns[0, joint].tolist(), skeleton.children[joint]
-        document.nodes.append(gltf.Node(name=name, translation=place.tolist(), rotation=turn, children=children))
+    joints = list(range(skeleton.num_joints))
+    places = [root[0], *skeleton.offsets[1:]]
+    nodes = []
+    for name, place, turn, children in zip(skeleton.names, places, turns[0], skeleton.children, strict=True):
+        node = {"name": name, "translation": place.tolist(), "rotation": turn.tolist()}
+        nodes.append(node | ({"children": children} if children else {}))  # the standard knows no empty list
+    nodes.append({"name": motion.name or "character", "mesh": 0, "skin": 0})
     inverse = np.tile(np.eye(4), (skeleton.num_joints, 1, 1))
     inverse[:, :3, 3] = -skeleton.rest_positions
-    joints = list(range(skeleton.num_joints))
-    document.skins.append(gltf.Skin(joints=joints, skeleton=0, inverseBindMatrices=file.put(inverse, "f4")))
+    skin = {"joints": joints, "skeleton": 0, "inverseBindMatrices": file.put(inverse, "f4")}
     padding = ((0, 0), (0, 4 - body.joints.shape[1]))
     corners = body.vertices[body.faces]
     normals = np.zeros_like(body.vertices)  # of a vertex: the sum of its faces' ones, which weighs them by area
     np.add.at(normals, body.faces, np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, None])
-    attributes = gltf.Attributes(
-        POSITION=file.put(body.vertices, "f4", gltf.ARRAY_BUFFER),
-        NORMAL=file.put(normals / np.linalg.norm(normals, axis=1, keepdims=True), "f4", gltf.ARRAY_BUFFER),
-        JOINTS_0=file.put(
-            np.pad(body.joints, padding), "u1" if skeleton.num_joints <= 256 else "u2", gltf.ARRAY_BUFFER
-        ),
-        WEIGHTS_0=file.put(np.pad(body.weights, padding), "f4", gltf.ARRAY_BUFFER),
-    )
-    indices = file.put(body.faces.ravel(), "u4", gltf.ELEMENT_ARRAY_BUFFER)
-    mesh = gltf.Mesh(primitives=[gltf.Primitive(attributes=attributes, indices=indices, material=0)])
-    document.meshes.append(mesh)
-    material = gltf.PbrMetallicRoughness(baseColorFactor=_GREY, metallicFactor=0.0, roughnessFactor=0.8)
-    document.materials.append(gltf.Material(name="body", pbrMetallicRoughness=material))
-    top = _append(document.nodes, gltf.Node(name=motion.name or "character", mesh=0, skin=0))
-    animation = gltf.Animation(name="motion")
-    turning = [(joint, "rotation", turns[:, joint]) for joint in joints]
-    for node, channel, values in [(0, "translation", root), *turning]:
-        sampler = _append(animation.samplers, gltf.AnimationSampler(input=times, output=file.put(values, "f4")))
-        target = gltf.AnimationChannelTarget(node=node, path=channel)
-        animation.channels.append(gltf.AnimationChannel(sampler=sampler, target=target))
-    document.animations.append(animation)
-    document.scenes.append(gltf.Scene(nodes=[0, top]))
-    document.scene = 0
-    document.buffers.append(gltf.Buffer(byteLength=len(file.bytes)))
-    document.set_binary_blob(file.bytes)
-    return write_whole(path, b"".join(document.save_to_bytes()), overwrite=overwrite)
+    attributes = {
+        "POSITION": file.put(body.vertices, "f4", **_CORNERS),
+        "NORMAL": file.put(normals / np.linalg.norm(normals, axis=1, keepdims=True), "f4", **_CORNERS),
+        "JOINTS_0": file.put(np.pad(body.joints, padding), "u1" if skeleton.num_joints <= 256 else "u2", **_CORNERS),
+        "WEIGHTS_0": file.put(np.pad(body.weights, padding), "f4", **_CORNERS),
+    }
+    mesh = {"attributes": attributes, "indices": file.put(body.faces.ravel(), "u4", **_FACES), "material": 0}
+    surface = {"baseColorFactor": _GREY, "metallicFactor": 0.0, "roughnessFactor": 0.8}
+    moving = [(0, "translation", root), *((joint, "rotation", turns[:, joint]) for joint in joints)]
+    samplers = [{"input": times, "output": file.put(values, "f4")} for _, _, values in moving]
+    channels = [{"sampler": k, "target": {"node": node, "path": path}} for k, (node, path, _) in enumerate(moving)]
+    document = {
+        "asset": {"version": "2.0", "generator": "f3amd_lib"} | ({"copyright": credit} if credit else {}),
+        "scene": 0, "scenes": [{"nodes": [0, len(joints)]}], "nodes": nodes, "skins": [skin],
+        "meshes": [{"primitives": [mesh]}], "materials": [{"name": "body", "pbrMetallicRoughness": surface}],
+        "animations": [{"name": "motion", "samplers": samplers, "channels": channels}],
+        "accessors": file.accessors, "bufferViews": file.views, "buffers": [{"byteLength": len(file.bytes)}],
+    }  # fmt: skip
+    text = json.dumps(document, ensure_ascii=False, separators=(",", ":")).encode()
+    chunks = ((b"JSON", text + b" " * (-len(text) % 4)), (b"BIN\0", file.bytes))
+    content = b"".join(struct.pack("<I4s", len(chunk), kind) + chunk for kind, chunk in chunks)
+    return write_whole(path, struct.pack("<4sII", b"glTF", 2, 12 + len(content)) + content, overwrite=overwrite)
 
 
 def write_motion_csv(path, motion: Motion, *, overwrite: bool = False) -> Path:
