@@ -245,8 +245,8 @@ def dataset(
     """
     terminal.check_there(captions, source)
     terminal.check_writable(out)
-    from f3amd_companion.serving import captioned_folder
     from f3amd_lib.data import sources
+    from f3amd_lib.text.data import captioned_folder
 
     opened = sources.open_dataset(data, path=source, **people.asked())
     written = captioned_folder.captioned_motions(opened, captioned_folder.read_caption_table(captions), fps=fps)

@@ -29,7 +29,6 @@ import pandas as pd
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this tree's library, whatever is installed
 
-from f3amd_companion.serving.captioned_folder import read_caption_table, write_humanml3d
 from f3amd_lib.data.packed import load_packed, pack, save_packed
 from f3amd_lib.data.sources import open_dataset
 from f3amd_lib.ground.files import whole_file
@@ -37,6 +36,7 @@ from f3amd_lib.ground.records import kept_rows, read_table, write_table
 from f3amd_lib.motion.bvh import format_bvh, read_bvh
 from f3amd_lib.motion.root_paths import read_path_csv
 from f3amd_lib.motion.skeleton import Motion, Skeleton
+from f3amd_lib.text.data.captioned_folder import read_caption_table, write_humanml3d
 from f3amd_lib.text.data.humanml3d import read_humanml3d
 from f3amd_lib.text.data.text_motions import text_motions
 

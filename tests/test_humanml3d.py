@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 
 from f3amd_companion.__main__ import main
-from f3amd_companion.serving import captioned_folder
 from f3amd_lib.data.sources import open_dataset
 from f3amd_lib.motion import synthetic
 from f3amd_lib.motion.bvh import write_bvh
 from f3amd_lib.motion.rotations import matrix_from_euler
 from f3amd_lib.motion.skeleton import forward_kinematics, resample, turn
-from f3amd_lib.text.data import humanml3d, redundant
+from f3amd_lib.text.data import captioned_folder, humanml3d, redundant
 from f3amd_lib.text.data.text_motions import TextMotions
 from f3amd_lib.text.stages import motionpcm_training
 

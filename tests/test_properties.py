@@ -18,12 +18,12 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from scipy.spatial.transform import Rotation
 
-from f3amd_companion.serving.captioned_folder import write_caption_line, write_humanml3d
 from f3amd_lib.ground.records import read_table, write_table
 from f3amd_lib.ground.trees import load_tree, save_tree
 from f3amd_lib.motion.bvh import format_bvh, parse_bvh
 from f3amd_lib.motion.root_paths import read_path_csv
 from f3amd_lib.motion.skeleton import Motion, Skeleton
+from f3amd_lib.text.data.captioned_folder import write_caption_line, write_humanml3d
 from f3amd_lib.text.data.humanml3d import read_caption_line, read_humanml3d
 from f3amd_lib.text.data.text_motions import text_motions
 

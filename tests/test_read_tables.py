@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from builders import refused
 
-from f3amd_companion.serving.captioned_folder import read_caption_table
 from f3amd_lib.ground.tables import read_text_table
 from f3amd_lib.motion.root_paths import read_path_csv
+from f3amd_lib.text.data.captioned_folder import read_caption_table
 
 PLAIN = 'file,caption\ngehe_ü.bvh,a person walks\nb/c.bvh,"walks, then stops"\n'
 HABITS = {
