@@ -193,7 +193,7 @@ def test_the_page_holds_everything_and_asks_for_nothing():
     for tag, attributes in Elements(page).tags:
         assert "src" not in attributes and "srcset" not in attributes
         assert tag != "link" or attributes["href"] == "data:,"
-    own = re.sub(r'id="modules">.*?</script>', "", page, flags=re.S)
+    own = re.sub(r'id="packed">.*?</script>', "", page, flags=re.S)
     assert "://" not in own and "@import" not in own and "url(" not in own
     for script in sorted(FOLDER.glob("*.js")):  # three.js names addresses of standards and asks for none
         assert script.name == "three.min.js" or "://" not in script.read_text(), script

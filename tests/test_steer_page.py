@@ -4,10 +4,10 @@ Its modules run in node. tests/web/test_steer.py has the page in a browser, with
 """
 
 import base64
-import gzip
 import json
 import re
 import subprocess
+import zlib
 from types import SimpleNamespace
 
 import builders
@@ -254,17 +254,21 @@ def carried(page: str, name: str):
     return json.loads(re.search(rf'id="{name}">(.*?)</script>', page, re.S)[1])
 
 
+def unpacked(page: str, kind: str) -> dict[str, bytes]:
+    return {name: zlib.decompress(base64.b64decode(text)) for name, text in carried(page, "packed")[kind].items()}
+
+
 def test_the_page_carries_everything_and_asks_for_nothing(trained, packages, tmp_path):
     path = write_steer(tmp_path / "steer.html", trained, program=b"weights")
     page = path.read_text(encoding="utf-8")
-    files = {name: gzip.decompress(base64.b64decode(text)) for name, text in carried(page, "steer-files").items()}
-    assert files["program"] == b"weights" and files["motion.js"] == (FOLDER / "motion.js").read_bytes()
+    files, modules = unpacked(page, "files"), unpacked(page, "modules")
+    assert files["program"] == b"weights" and b"export function lockFrame" in modules["motion"]
     poses = np.frombuffer(files["poses"], np.float32).reshape(2, builders.HISTORY, builders.CHANNELS)
     np.testing.assert_allclose(poses[:, -1, [0, 2]], 0.0, atol=1e-6)
     data = carried(page, "steer-data")
     assert data["card"]["legs"] is None and 'id="feet" disabled' in page  # legs of these are no legs
     assert data["card"]["styles"] == ["calm", "proud"] and data["card"]["window"] == builders.WINDOW
-    assert {name for name, _ in data["modules"]} | {"worker", "wasm", "program", "poses"} == set(files)
+    assert set(files) == {"worker", "wasm", "program", "poses"} and set(modules) == {"core", "three", "motion", "steer"}
     head = page.split('<script type="application/json" id="steer-data">')[0]
     assert "http" not in head.replace("http-equiv", "") and "default-src 'none'" in head
     assert "&lt;nobody&gt;" in head and "CC0" in head and "inertialised" in head
@@ -273,9 +277,7 @@ def test_the_page_carries_everything_and_asks_for_nothing(trained, packages, tmp
 
 
 def test_the_worker_is_one_script_without_modules(trained, packages):
-    worker = gzip.decompress(
-        base64.b64decode(carried(steer_page(trained, program=b""), "steer-files")["worker"])
-    ).decode()
+    worker = unpacked(steer_page(trained, program=b""), "files")["worker"].decode()
     assert "const ort=(()=>{var a=1" in worker and "return{InferenceSession:a,default:b}" in worker
     assert not re.search(r"^(import|export) |import\.meta", worker, re.M)
 
@@ -284,8 +286,7 @@ def test_the_page_for_a_graphics_card_carries_the_runtime_for_both(trained, monk
     monkeypatch.setattr(steer, "package_file", lambda package, path: BUNDLE + path.encode())
     for runtime, words in (("wasm", ("ort.wasm.", "threaded.wasm")), ("webgpu", ("ort.webgpu.", "asyncify.wasm"))):
         page = steer_page(trained, program=b"", runtime=runtime)
-        files = {name: gzip.decompress(base64.b64decode(text)) for name, text in carried(page, "steer-files").items()}
-        found = files["wasm"].decode()
+        found = unpacked(page, "files")["wasm"].decode()
         assert words[1] in found and carried(page, "steer-data")["card"]["webgpu"] is (runtime == "webgpu")
         assert steer.RUNTIMES[runtime][0].startswith(f"dist/{words[0]}")
     refused("unknown runtime 'webgl'", steer_page, trained, program=b"", runtime="webgl")

@@ -26,9 +26,10 @@ import html
 import json
 import string
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -150,16 +151,18 @@ def player_page(scenes, *, title: str = "", credit: str = "", autoplay: bool = T
         "tracks": base64.b64encode(zlib.compress(b"".join(tracks), 9)).decode("ascii"),
     }
     named = title or ", ".join(scene.title for scene in scenes if scene.title) or "Motion"
-    return string.Template(read_web("player.html")).substitute(
-        policy=POLICY,
-        title=html.escape(named),
-        heading=_element("h1", title),
-        colors=_color_rules(),
-        style=read_web("player.css"),
-        panels="\n".join(_panel(scene, first) for scene in scenes),
-        credit=_element('p class="credit"', credit),
-        data=page_json(data),
-        modules=module_scripts("player"),
+    texts = {
+        "policy": POLICY,
+        "title": html.escape(named),
+        "heading": _element("h1", title),
+        "colors": _color_rules(),
+        "style": read_web("player.css"),
+        "panels": "\n".join(_panel(scene, first) for scene in scenes),
+        "credit": _element('p class="credit"', credit),
+    }
+    modules = {"three": (FOLDER / "three.min.js").read_text(encoding="utf-8")}
+    return whole_page(
+        "player", texts, data, modules | {name: read_web(f"{name}.js") for name in ("scene", "body", "bvh")}
     )
 
 
@@ -307,28 +310,28 @@ def read_web(name: str) -> str:
     return "\n".join(line for line in stripped if line and not line.startswith("//"))
 
 
-def module_scripts(start: str) -> str:
-    """Return the elements of a page that hold modules and start one.
+def whole_page(name: str, texts: dict, data, modules: dict, files: Mapping[str, bytes] = MappingProxyType({})) -> str:
+    """Fill the template of a page, with its modules and files inside.
 
-    A page carries them compressed; a few lines unpack them, tell the browser their names in an import map, and start
-    one. Browsers of 2023 and later can do that (Chrome 89, Firefox 113, Safari 16.4).
+    They are carried compressed; `web/start.js` unpacks them, tells the browser the modules' names in an import map, and
+    calls `start(files)` of the one that is called as the page. Browsers of 2023 and later can do that (Chrome 89,
+    Firefox 113, Safari 16.4).
 
     Args:
-      start: name of the module that begins; `NAME.js` in `serving/web`. It may import three, scene, body and bvh.
-
-    Returns:
-      Two script elements. The page has to have an element "message" (hidden) and a policy that allows `blob:` scripts
-      (`POLICY`).
+      name: of the template, which has an element "message" (hidden), and of the module; both in `serving/web`.
+      texts: what the template asks for, ready for HTML; its policy has to allow `blob:` scripts.
+      data: what stands as JSON in the page.
+      modules: other JavaScript, by the name by which it is imported.
+      files: what `start` is given.
     """
-    texts = {"three": (FOLDER / "three.min.js").read_text(encoding="utf-8")}
-    texts |= {name: read_web(f"{name}.js") for name in ("scene", "body", "bvh", start)}
-    packed = {name: base64.b64encode(zlib.compress(text.encode(), 9)).decode() for name, text in texts.items()}
-    modules = json.dumps({"start": start, "modules": packed})
-    begin = read_web("start.js")
-    return f'<script type="application/json" id="modules">{modules}</script>\n<script>\n{begin}\n</script>'
+    pack = lambda part: base64.b64encode(zlib.compress(part, 9)).decode()
+    scripts = {key: pack(text.encode()) for key, text in {**modules, name: read_web(f"{name}.js")}.items()}
+    packed = {"start": name, "modules": scripts, "files": {key: pack(part) for key, part in files.items()}}
+    carried = {"start": read_web("start.js"), "data": _page_json(data), "packed": _page_json(packed)}
+    return string.Template(read_web(f"{name}.html")).substitute(texts, **carried)
 
 
-def page_json(value) -> str:
+def _page_json(value) -> str:
     """Return a value as JSON that may stand in a script element: "</script>" in a name would end the element."""
     return json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
 

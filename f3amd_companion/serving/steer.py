@@ -1,15 +1,13 @@
 """A page on which one steers a trained model: the network runs in the browser.
 
 `steer_page` makes one HTML file with everything in it: the weights as ONNX, ONNX Runtime for WebAssembly, three.js, and
-our own modules (`serving/web`). All of it is gzipped and in base64, so that the page works from a disk and asks nothing
-of anybody. `web/loader.js` unpacks it and hands each module the addresses of those it imports.
+our own modules (`serving/web`). All of it is in the page, as `player.whole_page` says, so that it works from a disk and
+asks nothing of anybody.
 
 Runtime and three.js are npm packages of fixed versions, fetched once from the public registry, checked by sha512 and
 kept in the cache; npm itself is not needed.
 """
 
-import base64
-import gzip
 import html
 import re
 import string
@@ -22,7 +20,7 @@ import pooch
 
 from f3amd_companion.serving.foot_locking import leg_chains
 from f3amd_companion.serving.onnx_export import denoiser_program, model_card
-from f3amd_companion.serving.player import FOLDER, POLICY, page_json, read_web
+from f3amd_companion.serving.player import POLICY, read_web, whole_page
 from f3amd_lib.drawing.stick_figures import LIMB_COLORS, TARGET_COLOR, bones_of, head_and_parent
 from f3amd_lib.ground.files import named_file, read_toml, write_whole
 from f3amd_lib.ground.names import check_known
@@ -30,9 +28,6 @@ from f3amd_lib.rollout.start_poses import pose_speed
 from f3amd_lib.training.checkpoints import TrainedModel
 
 _PAGE, _PINNED = (read_toml(Path(__file__).with_name(name)) for name in ("steer.toml", "npm_packages.toml"))
-MODULES = _PAGE["modules"]
-"""Modules of the page, each after those it imports: name, specifier, and its place in three.js, if it is from there."""
-
 RUNTIMES = _PAGE["runtimes"]
 """What runs the network -> the script of ONNX Runtime, and its program; the second one also runs without WebGPU."""
 
@@ -72,18 +67,10 @@ def steer_page(
         legs = None
     first, *others = sorted(trained.styles, key=lambda style: style != "Neutral")
     others = sorted(others, key=lambda style: style != "Proud")
-    files = {name: package_file("three", path) if path else (FOLDER / name).read_bytes() for name, _, path in MODULES}
-    files |= {
-        "worker": _worker(RUNTIMES[runtime][0]).encode(),
-        "wasm": package_file("onnxruntime-web", RUNTIMES[runtime][1]),
-        "program": program,
-        "poses": np.asarray(poses, np.float32).tobytes(),
-    }
     data = {
         "card": {key: value for key, value in card.items() if key not in ("about", "inputs", "output", "format")}
         | {name: getattr(trained.config, name) for name in ("window", "num_history", "channels")}
         | {"legs": legs, "webgpu": runtime == "webgpu"},
-        "modules": [(name, specifier) for name, specifier, _ in MODULES],
         "bones": bones_of(trained.skeleton),
         "head": head_and_parent(trained.skeleton),
         "paces": paces,
@@ -96,26 +83,28 @@ def steer_page(
     steps = "".join(choice.format(number, " checked" * (number == num_steps)) for number in offered)
     credits = card["credit"], f"Terms: {card['terms']}", *map(package_credit, ("onnxruntime-web", "three"))
     marks = "\n".join(f"b.{name} {{ color: {color}; }}" for name, color in _MARKS.items())
-    packed = {name: base64.b64encode(gzip.compress(file, 9, mtime=0)).decode() for name, file in files.items()}
     count = sum(np.size(leaf) for leaf in jax.tree.leaves(trained.params))
-    return string.Template(read_web("steer.html")).substitute(
-        policy=f"{POLICY} 'wasm-unsafe-eval'; worker-src blob:",
-        title=html.escape(f"Steer {trained.name}"),
-        name=html.escape(trained.name),
-        about=html.escape(f"{trained.name}, trained on {card['data']}, a diffusion model of {count:,} weights."),
-        window=trained.config.window,
-        history=trained.config.num_history,
-        runtime=html.escape(package_credit("onnxruntime-web").split(":")[0]),
-        credit=html.escape(". ".join(filter(None, credits))),
-        licence=html.escape(package_file("three", "LICENSE").decode("utf-8", "replace")),
-        steps=steps,
-        feet=" checked" if legs else " disabled",
-        about_feet=_PAGE["feet_held" if legs else "feet_not_held"],
-        style=string.Template(read_web("steer.css")).substitute(marks=marks),
-        data=page_json(data),
-        files=page_json(packed),
-        loader=read_web("loader.js"),
-    )
+    texts = {
+        "policy": f"{POLICY} 'wasm-unsafe-eval'; worker-src blob:",
+        "title": html.escape(f"Steer {trained.name}"),
+        "name": html.escape(trained.name),
+        "about": html.escape(f"{trained.name}, trained on {card['data']}, a diffusion model of {count:,} weights."),
+        "window": trained.config.window,
+        "history": trained.config.num_history,
+        "runtime": html.escape(package_credit("onnxruntime-web").split(":")[0]),
+        "credit": html.escape(". ".join(filter(None, credits))),
+        "licence": html.escape(package_file("three", "LICENSE").decode("utf-8", "replace")),
+        "steps": steps,
+        "feet": " checked" if legs else " disabled",
+        "about_feet": _PAGE["feet_held" if legs else "feet_not_held"],
+        "style": string.Template(read_web("steer.css")).substitute(marks=marks),
+    }
+    core, three = (package_file("three", f"build/three.{part}.js").decode() for part in ("core", "module"))
+    modules = {"core": core, "three": three.replace("./three.core.js", "core"), "motion": read_web("motion.js")}
+    script, wasm = RUNTIMES[runtime]
+    files = {"worker": _worker(script).encode(), "wasm": package_file("onnxruntime-web", wasm), "program": program}
+    files["poses"] = np.asarray(poses, np.float32).tobytes()
+    return whole_page("steer", texts, data, modules, files)
 
 
 def write_steer(path, trained: TrainedModel, *, overwrite: bool = True, **options) -> Path:

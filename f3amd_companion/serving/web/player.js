@@ -891,7 +891,7 @@ function listen() {
 
 // ---------------------------------------------------------------- start
 
-async function start() {
+export async function start() {
   document.documentElement.classList.toggle("embedded", embedded);
   unpack(await inflate(data.tracks));
   delete data.tracks;
@@ -959,9 +959,3 @@ async function start() {
   };
   document.documentElement.dataset.ready = "yes";
 }
-
-start().catch((error) => {
-  const message = byId("message");
-  message.textContent = `This motion cannot be shown: ${error.message}.`;
-  message.hidden = false;
-});

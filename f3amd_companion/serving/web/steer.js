@@ -1,6 +1,6 @@
 // The page around the worker: what the player wishes, when a new window is asked for, and the picture.
 import * as THREE from "three";
-import { FPS, jointPositions } from "./motion.js";
+import { FPS, jointPositions } from "motion";
 
 const HOP = 8, BLEND = 4, MOST = 32, RECORDED = 1800;
 const STICK = 0.028, JOINT = 0.034, HEAD = 0.1;
@@ -264,9 +264,10 @@ class Network {
 
 const median = (values) => [...values].sort((a, b) => a - b)[values.length >> 1];
 
-export async function start(data, files, workerUrl) {
+export async function start(files) {
+  const data = JSON.parse(document.getElementById("steer-data").textContent);
   const { card } = data, $ = (id) => document.getElementById(id), canvas = $("view");
-  const picture = new Picture(canvas, data), network = new Network(workerUrl);
+  const picture = new Picture(canvas, data), network = new Network(URL.createObjectURL(new Blob([files.worker], { type: "text/javascript" })));
   const styleOf = (name) => card.styles.indexOf(name);
   const options = { steps: document.querySelector("input[name=steps]:checked").value, count: 1, hop: HOP, made: false, locking: $("feet").checked };
   const tapes = []; // per character: its points, frame by frame; all end at the same frame
@@ -445,7 +446,7 @@ export async function start(data, files, workerUrl) {
   requestAnimationFrame(loop);
   document.documentElement.dataset.ready = "yes";
 
-  return {
+  window.steer = {
     state: () => ({
       clock, newest, rounds, waits, hop: options.hop, ms: times.length ? median(times) : null, timed: times.length, rate: rate(),
       count: tapes.length, targets: last?.targets, around: picture.around, frozen, runs, sharpness: picture.sharpness, pictures: drawn.length,
