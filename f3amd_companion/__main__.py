@@ -318,35 +318,31 @@ def train(
     of_latents = [name for name in preset if name.startswith(("MotionPCM", "MotionLCM"))]
     if teacher is not None and not (preset and set(of_latents) == set(preset)):
         raise ValueError("--teacher is for students of MotionPCM: leave it out")
+    own, leg = {"batch_size": batch_size, "seed": seed}, {"folder": out, "stop_at": _stop_at(minutes)}
     if of_latents or any(name == "judge" or "ACMDM" in name for name in preset):
         if all_devices:
             raise ValueError("models of captioned motion train on one device: leave --all-devices out")
-        return _train_text(motion, preset, minutes, steps, batch_size, seed, out, teacher)
-    prepared, profile = motion.open(train_steps=steps, batch_size=batch_size, seed=seed)
-    from f3amd_lib.training import pipeline
-    from f3amd_lib.training.optimise import all_devices as mesh_of_all
+        files, train_one = _text_trainings(motion, preset, steps, own, teacher, **leg)
+    else:
+        prepared, profile = motion.open(train_steps=steps, **own)
+        from f3amd_lib.training import optimise, pipeline
 
-    how = {"folder": out, "stop_at": _stop_at(minutes), "mesh": mesh_of_all() if all_devices else None}
-    files = {name: pipeline.model_files(profile, name, folder=out) for name in preset or [profile.preset]}
-    for name, its in files.items():
-        trained = pipeline.finished_model(prepared, profile, name, its)
-        if trained is None:
-            trained, _ = pipeline.train(prepared, profile, preset=name, **how)
-        if not _say_trained([*files], name, its, trained is not None):
+        leg["mesh"] = optimise.all_devices() if all_devices else None
+        files = {name: pipeline.model_files(profile, name, folder=out) for name in preset or [profile.preset]}
+        finished = lambda name: pipeline.finished_model(prepared, profile, name, files[name])
+        train_one = lambda name: finished(name) or pipeline.train(prepared, profile, preset=name, **leg)[0]
+    for number, (name, its) in enumerate(files.items(), 1):
+        done = train_one(name) is not None
+        log.info("%-12s %s", name, its.model if done else f"unfinished; what is done: {its.state}")
+        if not done:
+            if waiting := [*files][number:]:
+                log.info("not begun    %s", ", ".join(waiting))
             return UNFINISHED
     return 0
 
 
-def _say_trained(names: Sequence[str], name: str, files, finished: bool) -> bool:
-    """Say what became of one of the models to train, and which of them wait, and return whether it is finished."""
-    log.info("%-12s %s", name, files.model if finished else f"unfinished; what is done: {files.state}")
-    if not finished and (waiting := names[names.index(name) + 1 :]):
-        log.info("not begun    %s", ", ".join(waiting))
-    return finished
-
-
-def _train_text(motion: Data, names, minutes, steps, batch_size, seed, out, teacher) -> int:
-    """Train models of text to motion, or their judge; what is finished is left as it is."""
+def _text_trainings(motion: Data, names, steps, own: dict, teacher, *, folder, stop_at):
+    """Return the files of models of text to motion, or of their judge, by name, and what trains the one of a name."""
     from f3amd_lib.text.data.text_encoders import load_text_encoder
     from f3amd_lib.text.judge import text_judge
     from f3amd_lib.text.stages import text_models, train_stage
@@ -354,20 +350,18 @@ def _train_text(motion: Data, names, minutes, steps, batch_size, seed, out, teac
     for name in names:
         if name != text_models.JUDGE:
             train_stage.stage_of(name)  # refuses those that need no captions
-    own, stop_at = {"batch_size": batch_size, "seed": seed}, _stop_at(minutes)
     profile = motion.numbers(train_steps=steps, **own)
-    data, encoder = text_models.open_text_motions(motion.data, motion.source), load_text_encoder()
-    how = {"window": motion.window, "batch_size": batch_size, "folder": out, "teacher": teacher, "stop_at": stop_at}
-    for name in names:
-        files = text_models.text_model_files(profile, name, folder=out)
+    given = text_models.open_text_motions(motion.data, motion.source), load_text_encoder()
+    files = {name: text_models.text_model_files(profile, name, folder=folder) for name in names}
+
+    def train_one(name: str):
         if name == text_models.JUDGE:
             training = text_judge.EvaluatorTraining(**_given(num_steps=steps, **own))
-            done = text_judge.train_judge(data, encoder, training, files=files, stop_at=stop_at)
-        else:
-            done = train_stage.train_stage(data, encoder, profile, name, **how)
-        if not _say_trained(names, name, files, done is not None):
-            return UNFINISHED
-    return 0
+            return text_judge.train_judge(*given, training, files=files[name], stop_at=stop_at)
+        how = {"window": motion.window, "batch_size": own["batch_size"], "folder": folder, "teacher": teacher}
+        return train_stage.train_stage(*given, profile, name, stop_at=stop_at, **how)
+
+    return files, train_one
 
 
 def rollout(
