@@ -1,7 +1,7 @@
 """The command `f3amd`, such as `f3amd rollout --style proud --path figure-eight --out out/`.
 
 A function a command: its parameters are the options, its docstring is their help. What needs JAX is
-imported inside, so that `f3amd --help` is quick.
+loaded where it is first used, so that `f3amd --help` and refusals are quick.
 """
 
 import contextlib
@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
+from etils import epy
 from tyro.conf import Positional, UseAppendAction
 
 from f3amd_companion import terminal
@@ -27,6 +28,39 @@ from f3amd_lib import __version__
 from f3amd_lib.ground.files import locked
 from f3amd_lib.ground.names import check_known, checked_seed, checked_value
 from f3amd_lib.ground.profiles import find_model, load_profile, results_dir, runs_dir
+
+with epy.lazy_imports():
+    import jax
+    import numpy as np
+    import pandas as pd
+    import safetensors
+
+    from f3amd_companion import reproduce
+    from f3amd_companion.ledger import claims as ledger
+    from f3amd_companion.ledger import model_cards
+    from f3amd_companion.measuring import campaign as long_queue
+    from f3amd_companion.measuring import measure as measuring
+    from f3amd_companion.measuring import runner, text_tables
+    from f3amd_companion.measuring import sweep as engine
+    from f3amd_companion.measuring import times as measurements
+    from f3amd_companion.serving import crowd as crowds
+    from f3amd_companion.serving import export as exports
+    from f3amd_companion.serving import finishing, foot_locking, motion_files, onnx_export, player
+    from f3amd_companion.serving import steer as steering
+    from f3amd_companion.speed import machine, speed_tables
+    from f3amd_lib.data import packed as packed_data
+    from f3amd_lib.data import sources
+    from f3amd_lib.drawing import pictures
+    from f3amd_lib.ground import papers, records, tables
+    from f3amd_lib.motion import bvh, inverse_kinematics, plausible, root_paths, skeleton
+    from f3amd_lib.networks import presets as network_presets
+    from f3amd_lib.rollout import generated, start_poses
+    from f3amd_lib.rollout import rollout as rollouts
+    from f3amd_lib.text.data import captioned_folder, text_encoders
+    from f3amd_lib.text.judge import text_judge
+    from f3amd_lib.text.sampling import captioned_motion
+    from f3amd_lib.text.stages import text_models, train_stage
+    from f3amd_lib.training import checkpoints, optimise, pipeline
 
 log = logging.getLogger("f3amd")
 
@@ -48,10 +82,8 @@ def _stop_at(minutes: float | None) -> float | None:
 
 def _use_fast_flags() -> None:
     """Set XLA's flags, unless the user has; JAX reads them when it first looks for devices: call this before."""
-    from f3amd_companion.speed.machine import fast_xla_flags
-
     if "XLA_FLAGS" not in os.environ:
-        os.environ["XLA_FLAGS"] = fast_xla_flags()
+        os.environ["XLA_FLAGS"] = machine.fast_xla_flags()
 
 
 def _say_model(trained):
@@ -83,16 +115,11 @@ class Person:
 
     def mapped(self) -> dict[str, str]:
         """Return the joint map, role -> joint's name."""
-        from f3amd_lib.motion.plausible import read_joint_map
-
-        return read_joint_map(self.joint_map) if self.joint_map else {}
+        return plausible.read_joint_map(self.joint_map) if self.joint_map else {}
 
     def read(self, path: Path):
         """Read a file, and say what was corrected."""
-        from f3amd_lib.motion.bvh import read_bvh
-        from f3amd_lib.motion.plausible import as_person
-
-        motion, notes = as_person(read_bvh(path), joint_map=self.mapped(), scale=self.scale, up=self.up)
+        motion, notes = plausible.as_person(bvh.read_bvh(path), joint_map=self.mapped(), scale=self.scale, up=self.up)
         if notes:
             log.info("corrected    %s: %s", path, "; ".join(notes))
         return motion
@@ -140,9 +167,7 @@ class Data:
         """Return the data set, prepared, and the profile as `numbers` does, with this window."""
         profile = self.numbers(**overrides, window=self.window)
         terminal.check_there(self.source)
-        from f3amd_lib.training.pipeline import prepare
-
-        return prepare(profile, path=self.source, **self.people.asked()), profile
+        return pipeline.prepare(profile, path=self.source, **self.people.asked()), profile
 
 
 @dataclass(frozen=True)
@@ -173,12 +198,10 @@ class Model:
     @property
     def styles(self) -> list[str]:
         """Return the styles that the model knows, from the head of its file: JAX is not loaded."""
-        from safetensors import SafetensorError, safe_open
-
         try:
-            with safe_open(self.file, framework="numpy") as file:
+            with safetensors.safe_open(self.file, framework="numpy") as file:
                 return list(json.loads(file.metadata()["description"])["styles"])
-        except (SafetensorError, OSError, LookupError, TypeError, ValueError):
+        except (safetensors.SafetensorError, OSError, LookupError, TypeError, ValueError):
             raise ValueError(f"{self.file}: no whole file of a model with styles") from None
 
     def style(self, asked: str) -> str:
@@ -191,15 +214,11 @@ class Model:
     def load(self):
         """Load the model, and say what it is."""
         file = self.file
-        from f3amd_lib.training.checkpoints import load_model
-
-        return _say_model(load_model(file))
+        return _say_model(checkpoints.load_model(file))
 
     def generator(self):
         """Return what animates characters with the model."""
-        from f3amd_lib.rollout.rollout import MotionGenerator
-
-        return MotionGenerator(self.load(), self.steps, sampler=self.sampler)
+        return rollouts.MotionGenerator(self.load(), self.steps, sampler=self.sampler)
 
 
 def joints(file: Positional[Path], person: Person) -> None:
@@ -220,10 +239,8 @@ def joints(file: Positional[Path], person: Person) -> None:
 def data(motion: Data) -> None:
     """Open a data set, build its packed cache, say what is in it."""
     packed = motion.open()[0].packed
-    from f3amd_lib.data.sources import SPLITS
-
     splits = packed.clip_split.tolist()
-    split = ", ".join(f"{splits.count(number)} {name}" for number, name in enumerate(SPLITS))
+    split = ", ".join(f"{splits.count(number)} {name}" for number, name in enumerate(sources.SPLITS))
     log.info("data set     %s, %s; %s", packed.name, packed.licence, packed.credit)
     log.info("clips        %d (%d left out): %s", packed.num_clips, len(packed.skipped), split)
     log.info("frames       %d at 30 fps, of %d joints", packed.num_frames, packed.skeleton.num_joints)
@@ -245,9 +262,6 @@ def dataset(
     """
     terminal.check_there(captions, source)
     terminal.check_writable(out)
-    from f3amd_lib.data import sources
-    from f3amd_lib.text.data import captioned_folder
-
     opened = sources.open_dataset(data, path=source, **people.asked())
     written = captioned_folder.captioned_motions(opened, captioned_folder.read_caption_table(captions), fps=fps)
     _say_written(captioned_folder.write_humanml3d(out, written))
@@ -280,17 +294,12 @@ def presets(
       joints: J, for ACMDM's.
       text_width: for ACMDM's and MotionPCM's: numbers in a caption's embedding; by default the paper's encoder's.
     """
-    from f3amd_lib.ground.papers import load_sizes
-    from f3amd_lib.ground.tables import markdown_table
-
-    table, asked = load_sizes(paper), (channels, styles, joints, text_width)
+    table, asked = papers.load_sizes(paper), (channels, styles, joints, text_width)
     if table is None or asked != (141, 100, 22, None):
-        from f3amd_lib.networks import presets
-
         of_data = {"channels": channels, "num_styles": styles, "num_joints": joints} | _given(text_width=text_width)
-        table = presets.table(paper, **of_data)
+        table = network_presets.table(paper, **of_data)
     short = {"latent_width": "width", "mflop_per_evaluation": "MFLOP"}
-    log.info("%s", markdown_table(table.drop(columns=["depth", "diffusion", "sampler"]).rename(columns=short)))
+    log.info("%s", tables.markdown_table(table.drop(columns=["depth", "diffusion", "sampler"]).rename(columns=short)))
 
 
 def train(
@@ -325,8 +334,6 @@ def train(
         files, train_one = _text_trainings(motion, preset, steps, own, teacher, **leg)
     else:
         prepared, profile = motion.open(train_steps=steps, **own)
-        from f3amd_lib.training import optimise, pipeline
-
         leg["mesh"] = optimise.all_devices() if all_devices else None
         files = {name: pipeline.model_files(profile, name, folder=out) for name in preset or [profile.preset]}
         finished = lambda name: pipeline.finished_model(prepared, profile, name, files[name])
@@ -343,15 +350,11 @@ def train(
 
 def _text_trainings(motion: Data, names, steps, own: dict, teacher, *, folder, stop_at):
     """Return the files of models of text to motion, or of their judge, by name, and what trains the one of a name."""
-    from f3amd_lib.text.data.text_encoders import load_text_encoder
-    from f3amd_lib.text.judge import text_judge
-    from f3amd_lib.text.stages import text_models, train_stage
-
     for name in names:
         if name != text_models.JUDGE:
             train_stage.stage_of(name)  # refuses those that need no captions
     profile = motion.numbers(train_steps=steps, **own)
-    given = text_models.open_text_motions(motion.data, motion.source), load_text_encoder()
+    given = text_models.open_text_motions(motion.data, motion.source), text_encoders.load_text_encoder()
     files = {name: text_models.text_model_files(profile, name, folder=folder) for name in names}
 
     def train_one(name: str):
@@ -385,20 +388,15 @@ def rollout(
     targets = _targets(out, f"{style}_{Path(path).stem}_seed{seed}", format, model.overwrite)
     terminal.check_there(start, path if drawn else None)
     log.info("animating    %s along %s", style, path)
-    from f3amd_companion.serving import player
-    from f3amd_companion.serving.finishing import held
-    from f3amd_companion.serving.foot_locking import lock_rollout
-    from f3amd_lib.motion.root_paths import named_path, read_path_csv
-    from f3amd_lib.rollout.start_poses import start_history
-
-    line = read_path_csv(path) if drawn else named_path(path, _num_frames(seconds), speed=speed, seed=seed)
+    how = {"speed": speed, "seed": seed}
+    line = root_paths.read_path_csv(path) if drawn else root_paths.named_path(path, _num_frames(seconds), **how)
     generator = model.generator()
     trained = generator.trained
     if start is not None:
-        history, note = start_history(trained, person.read(start), line)
+        history, note = start_poses.start_history(trained, person.read(start), line)
         log.info("start        %s", note)
     made = generator.rollout(line, style, seed=seed, history=history, blend_frames=0 if raw else 4)
-    made = made if raw else held(lock_rollout, made)
+    made = made if raw else finishing.held(foot_locking.lock_rollout, made)
     log.info("afterwards   %s", made.changes or "nothing: as the network made it")
     title = f"{trained.name}, {model.steps} step{'s' * (model.steps != 1)}, {style}, {Path(path).stem}"
     _write_shown(targets, player.rollout_scene(made, title), trained)
@@ -413,19 +411,15 @@ def _targets(folder: Path, name: str, format: str, overwrite: bool) -> list[Path
 
 def _write_shown(targets, scene, trained) -> None:
     """Write a scene of one character as player page with film strip, and in each format asked."""
-    from f3amd_companion.serving import motion_files, player
-    from f3amd_lib.drawing.pictures import write_gif
-    from f3amd_lib.rollout.generated import generated_credit
-
     _, page, *files = targets
     (character,) = scene.characters
     motion = character.motion
-    credit = generated_credit(trained.name, *map(trained.record.get, ("dataset_credit", "dataset_licence")))
+    credit = generated.generated_credit(trained.name, *map(trained.record.get, ("dataset_credit", "dataset_licence")))
     player.write_player(page, scene, credit=credit)  # the strip has its name
     for path in files:
         if path.suffix == ".gif":
             how = {"every": max(1, round(motion.fps / 10)), "max_seconds": 12.0}
-            write_gif(path, motion, target_paths=character.path, titles=[scene.title], **how)
+            pictures.write_gif(path, motion, target_paths=character.path, titles=[scene.title], **how)
         else:
             motion_files.write_motion(path, motion, credit=credit, overwrite=True)
     _say_written(*targets)
@@ -466,15 +460,6 @@ def text(
     name = f"{re.sub('[^a-z0-9]+', '-', ' then '.join(captions).lower()).strip('-')[:80]}_seed{seed}"
     targets = _targets(out, name, format, overwrite)
     terminal.check_there(weights, control, text_weights)
-    import jax
-    import numpy as np
-
-    from f3amd_companion.serving import player
-    from f3amd_lib.motion import inverse_kinematics, skeleton
-    from f3amd_lib.text.data import text_encoders
-    from f3amd_lib.text.sampling import captioned_motion
-    from f3amd_lib.text.stages import text_models
-
     captioned_motion.check_solver(steps, guidance)
     if weights is None:
         preset = model or (captioned_motion.STREAM_PRESET if then else None)
@@ -555,20 +540,16 @@ def crowd(
     terminal.check_writable(out)
     named = [model.style(one) for one in style] or None
     log.info("animating    %d characters, %.1f seconds each", characters, num_frames / 30)
-    from f3amd_companion.serving import finishing
-    from f3amd_companion.serving.crowd import MIN_DISTANCE, generate_crowd
-    from f3amd_lib.rollout.generated import generated_credit
-
     generator = model.generator()
-    made = generate_crowd(
+    made = crowds.generate_crowd(
         generator, characters, num_frames, out, styles=named,
-        min_distance=None if plan is None else (*plan, MIN_DISTANCE)[0], seed=seed, chunk=chunk,
+        min_distance=None if plan is None else (*plan, crowds.MIN_DISTANCE)[0], seed=seed, chunk=chunk,
         overwrite=model.overwrite, progress=True,
     )  # fmt: skip
     log.info("wrote        %s: %d characters of %d frames", out, len(made), made.num_frames)
     window = generator.trained.config.window
     shown = made.motion if raw else lambda character: finishing.finished(made.motion(character), window)
-    credit = generated_credit(*map(made.settings["model"].get, ("name", "dataset_credit", "dataset_licence")))
+    credit = generated.generated_credit(*map(made.settings["model"].get, ("name", "dataset_credit", "dataset_licence")))
     if formats:  # the longer part first: where it is stopped, nothing stands in the way of the same command
         finishing.crowd_motions(made, shown, credit, motions, formats)
         _say_written(motions)
@@ -591,22 +572,18 @@ def export(
     """
     terminal.check_writable(out)
     if "onnx" in target:
-        from f3amd_companion.serving import onnx_export
-
         if len(target) > 1 or model.sampler:
             raise ValueError("--target onnx goes alone, and without --sampler: what is exported is one evaluation")
         trained = (model.weights and onnx_export.load_text_or_latent(model.weights)) or model.load()
         how = {"batch": characters, "weights": stored}
         made = onnx_export.export_onnx(trained, out, num_steps=model.steps, overwrite=model.overwrite, **how)
     else:
-        from f3amd_companion.serving.export import export_model
-
         if not target and importlib.util.find_spec("iree"):
             target = ("llvm-cpu",)
         elif not target:
             log.info("not compiled for this processor, since IREE is missing: make bench-tools")
         how = {"batch": 1 if characters is None else characters, "sampler": model.sampler, "targets": target}
-        made = export_model(model.load(), out, num_steps=model.steps, overwrite=model.overwrite, **how)
+        made = exports.export_model(model.load(), out, num_steps=model.steps, overwrite=model.overwrite, **how)
     _say_written(*sorted(made.iterdir()))
 
 
@@ -620,9 +597,7 @@ def steer(model: Model, stored: str = "int8", runtime: str = "wasm", out: Path =
     """
     terminal.check_free([out], model.overwrite)
     terminal.check_there(model.file)
-    from f3amd_companion.serving.steer import write_steer
-
-    _say_written(write_steer(out, model.load(), num_steps=model.steps, weights=stored, runtime=runtime))
+    _say_written(steering.write_steer(out, model.load(), num_steps=model.steps, weights=stored, runtime=runtime))
 
 
 def bench(
@@ -639,19 +614,14 @@ def bench(
       parts: time a round without each part.
     """
     _use_fast_flags()
-    from f3amd_companion.measuring import times as measurements
-    from f3amd_companion.speed import speed_tables
-    from f3amd_lib.ground.records import read_table
-    from f3amd_lib.ground.tables import markdown_table
-
     suites = measurements.check_suites(suite)
     (prepared, profile), missed = motion.open(), False
     if suites or not (training or parts):
         how = {"characters": characters or None, "again": again}
         table = measurements.measure_synthesis_time(prepared, profile, suites, **how)
         every = table.with_name("synthesis_ways.csv")
-        bars = speed_tables.speed_bars(read_table(every)[0], suite="bars" if suites == ["bars"] else "main")
-        log.info("\n%s\n", markdown_table(bars, digits=3))
+        bars = speed_tables.speed_bars(records.read_table(every)[0], suite="bars" if suites == ["bars"] else "main")
+        log.info("\n%s\n", tables.markdown_table(bars, digits=3))
         _say_written(every, table)
         missed = "no" in set(bars["met"])
     if parts:
@@ -675,28 +645,22 @@ def measure(
       published: CAMDM's published weights as safetensors, one more row of quality.
       minutes: of text to motion: stop then; a later call goes on, and the exit status is 3.
     """
-    from f3amd_companion.measuring.measure import MEASUREMENTS
-    from f3amd_companion.measuring.text_tables import TEXT_MEASUREMENTS
-    from f3amd_lib.networks import presets
-    from f3amd_lib.text.data.text_encoders import load_text_encoder
-    from f3amd_lib.text.stages.text_models import open_text_motions
-
     for name in names:
-        check_known(name, [*MEASUREMENTS, *TEXT_MEASUREMENTS], "measurement")
-    if of_text := [name for name in names if name in TEXT_MEASUREMENTS]:
+        check_known(name, [*measuring.MEASUREMENTS, *text_tables.TEXT_MEASUREMENTS], "measurement")
+    if of_text := [name for name in names if name in text_tables.TEXT_MEASUREMENTS]:
         if len(of_text) < len(names):
             raise ValueError(f"{', '.join(of_text)}: measure text to motion by a call of its own")
         profile, how = motion.numbers(), {"models": model, "stop_at": _stop_at(minutes)}
-        given = open_text_motions(motion.data, motion.source), load_text_encoder(), profile
-        measurements = TEXT_MEASUREMENTS
+        given = text_models.open_text_motions(motion.data, motion.source), text_encoders.load_text_encoder(), profile
+        measurements = text_tables.TEXT_MEASUREMENTS
     else:
-        models = [presets.find_preset(name).name for name in model] or None
+        models = [network_presets.find_preset(name).name for name in model] or None
         prepared, profile = motion.open()
         of_windows = {"quality", "trained", "walking"} if not published else {"quality"}
         if (profile.window != motion.numbers().window or published) and not (names and {*names} <= of_windows):
             what = "--window is for quality, trained and walking, --published for quality"
             raise ValueError(f"{what}: measure these by name")
-        given, how, measurements = (prepared, profile, models), _given(published=published), MEASUREMENTS
+        given, how, measurements = (prepared, profile, models), _given(published=published), measuring.MEASUREMENTS
     for name in names or measurements:
         lock = results_dir(profile.dataset, profile.name) / "records" / f".{name}.lock"
         with locked(lock, f"measuring {name}"):
@@ -731,12 +695,6 @@ def campaign(
     stop_at = _stop_at(minutes)
     if times:
         _use_fast_flags()
-    from f3amd_companion.measuring import campaign as long_queue
-    from f3amd_companion.measuring.measure import protocol_of
-    from f3amd_companion.measuring.times import measure_synthesis_time, measure_training_time
-    from f3amd_lib.data.packed import load_packed
-    from f3amd_lib.training.pipeline import PreparedData
-
     check_known(queue, long_queue.QUEUES, "queue")
     long_queue.check_precision(precision)
     place, table = (long_queue.QUEUES[queue], queue) if package is None else (long_queue.GPU_PLAN, "readings")
@@ -746,18 +704,18 @@ def campaign(
         prepared, profile = motion.open()
     else:
         profile = motion.numbers()
-        prepared = PreparedData(load_packed(packed), profile.window, profile.num_history)
+        prepared = pipeline.PreparedData(packed_data.load_packed(packed), profile.window, profile.num_history)
     state, folder = "measured", out or runs_dir(profile.dataset, profile.name) / "campaign"
     how = {"snapshots": snapshots, "batch_size": batch_size, "precision": precision, "stop_at": stop_at}
     with locked(folder / ".campaign.lock", "running the campaign"):
-        for measure_time in (measure_synthesis_time, measure_training_time) if times else ():
+        for measure_time in (measurements.measure_synthesis_time, measurements.measure_training_time) if times else ():
             timed = measure_time(prepared, profile, stop_at=stop_at)
             log.info("%-12s %s", "times", timed or "unfinished")
             if timed is None:
                 return UNFINISHED
         if stop_at is not None and time.monotonic() >= stop_at:  # a style classifier may have to be trained
             return UNFINISHED
-        judges = () if package is not None and not measure else protocol_of(prepared, profile, "campaign")[:2]
+        judges = () if package is not None and not measure else measuring.protocol_of(prepared, profile, "campaign")[:2]
         how |= {"folder": folder, "table": table, "found_alone": measure}
         for name, windows, state in long_queue.run_campaign(prepared, profile, *judges, **how):
             log.info("%-12s %s, %s windows", state, name, f"{windows:,}")
@@ -779,13 +737,6 @@ def sweep(
       batch_size: windows a step of the queue's trainings; the paper's is 512.
       out: folder for legs, states and weights of the queue, instead of runs/DATA/PROFILE.
     """
-    import pandas as pd
-
-    from f3amd_companion.measuring import campaign as long_queue
-    from f3amd_companion.measuring import measure, runner
-    from f3amd_companion.measuring import sweep as engine
-    from f3amd_lib.ground.records import THROUGH_CLASSIFIER, run_record
-
     profile = motion.numbers()
     if motion.window not in (None, profile.window) or motion.people != People():
         raise ValueError("--window is for f3amd measure alone, and how a folder is read for one process")
@@ -799,9 +750,9 @@ def sweep(
             place = folder / "campaign" if name == engine.CAMPAIGN else results / "records"
             held.enter_context(locked(place / f".{name}.lock", f"doing {name}"))
         prepared, _ = motion.open()  # so that workers find the cache, and the classifier below
-        if engine.CAMPAIGN in names or not THROUGH_CLASSIFIER.isdisjoint(names):  # trained once, before the legs
-            measure.protocol_of(prepared, profile, "sweep")
-        record = run_record(profile=profile, dataset=prepared.packed, seed=profile.seed, measurement="sweep")
+        if engine.CAMPAIGN in names or not records.THROUGH_CLASSIFIER.isdisjoint(names):  # trained before the legs
+            measuring.protocol_of(prepared, profile, "sweep")
+        record = records.run_record(profile=profile, dataset=prepared.packed, seed=profile.seed, measurement="sweep")
         costs, finished = runner.Records(results / "records", record, {"sweep": ["leg"]}), []
         try:
             for number, (leg, told) in enumerate(engine.run_sweep(work, legs, workers=workers, scheduler=scheduler), 1):
@@ -824,8 +775,6 @@ def figures(data: str = "synthetic", profile: str = "laptop", only: Repeatable =
       only: number of a notebook; repeatable.
       set: NAME=VALUE, a parameter of every notebook that runs; repeatable.
     """
-    from f3amd_companion import reproduce
-
     parameters = dict(map(reproduce.parse_assignment, set))
     reproduce.set_folders(profile)
     took = reproduce.reproduce(data, profile, only=only, parameters=parameters, say=log.info)["seconds"]
@@ -840,8 +789,6 @@ def course(only: Repeatable = ()) -> None:
     Args:
       only: number of a notebook; repeatable.
     """
-    from f3amd_companion import reproduce
-
     reproduce.run_course(only, say=log.info)
 
 
@@ -852,15 +799,11 @@ def claims(accept: bool = False, paper: str | None = None) -> int:
       accept: take changed verdicts for right and write them down.
       paper: whose claims, such as acmdm; each paper's if none.
     """
-    from f3amd_companion.ledger import claims as ledger
-
     return ledger.main(accept, paper)
 
 
 def cards() -> int:
     """Write the cards of shipped weights, their checksums and the table of docs/results.md."""
-    from f3amd_companion.ledger import model_cards
-
     return model_cards.main()
 
 
