@@ -30,8 +30,6 @@ from f3amd_lib.ground.names import check_known, checked_seed, checked_value
 from f3amd_lib.ground.profiles import find_model, load_profile, results_dir, runs_dir
 
 with epy.lazy_imports():
-    import jax
-    import numpy as np
     import pandas as pd
     import safetensors
 
@@ -52,7 +50,7 @@ with epy.lazy_imports():
     from f3amd_lib.data import sources
     from f3amd_lib.drawing import pictures
     from f3amd_lib.ground import papers, records, tables
-    from f3amd_lib.motion import bvh, inverse_kinematics, plausible, root_paths, skeleton
+    from f3amd_lib.motion import bvh, plausible, root_paths
     from f3amd_lib.networks import presets as network_presets
     from f3amd_lib.rollout import generated, start_poses
     from f3amd_lib.rollout import rollout as rollouts
@@ -460,40 +458,20 @@ def text(
     name = f"{re.sub('[^a-z0-9]+', '-', ' then '.join(captions).lower()).strip('-')[:80]}_seed{seed}"
     targets = _targets(out, name, format, overwrite)
     terminal.check_there(weights, control, text_weights)
-    captioned_motion.check_solver(steps, guidance)
     if weights is None:
         preset = model or (captioned_motion.STREAM_PRESET if then else None)
         latent = model and text_models.is_latent_preset(text_models.named_model(model, steps))
         weights = text_models.find_text_model(data, preset, control=bool(control and not latent), num_steps=steps)
     trained = _say_model(text_models.load_text_model(weights))
-    if isinstance(trained, text_models.LatentModel) and (then or control):
-        raise ValueError(f"{trained.name} makes whole motions of one caption: leave out --then and --control")
     encoder = text_encoders.load_text_encoder(trained.text_encoder.split("-")[0], text_weights)
-    pooled = captioned_motion.told_captions(trained, encoder, captions, any_words=any_words)
-    key, how, boundaries = jax.random.key(seed), {"guidance": guidance, "num_steps": steps}, ()
-    if then or getattr(trained, "starts", ()):
-        windows = captioned_motion.told_windows(trained, seconds)
-        starts = text_encoders.embed_captions(list(trained.starts), encoder).pooled
-        counts = [windows] * len(captions)
-        positions = captioned_motion.stream_motions(trained, pooled, counts, key, starts=starts, **how)
-        each = windows * captioned_motion.window_frames(trained)
-        boundaries = range(len(positions) - each * len(captions), len(positions), each)
-    else:
-        num_frames = captioned_motion.told_frames(trained, seconds)
-        if control is not None:
-            which = captioned_motion.find_joint(trained, joint)
-            frames, points = captioned_motion.read_control_csv(control, num_frames)
-            how["control"] = captioned_motion.control_of(trained, which, frames, points, num_frames)
-        positions = captioned_motion.draw_motions(trained, pooled, num_frames, key, **how)[0]
-    title = ", then ".join(captions)
-    made = skeleton.Motion.from_positions(trained.skeleton, positions, trained.fps, title)
-    motion, moved = inverse_kinematics.fitted(made)
+    how = {"seconds": seconds, "seed": seed, "guidance": guidance, "num_steps": steps, "any_words": any_words}
+    made = captioned_motion.animate(trained, encoder, captions, control=control, joint=joint, **how)
     far = lambda metres: f"{100 * metres.mean():.1f} cm on average, {100 * metres.max():.1f} cm at most"
-    log.info("bones        joints moved by %s, so that bones keep their lengths", far(moved))
+    log.info("bones        joints moved by %s, so that bones keep their lengths", far(made.moved))
     if control is not None:
-        missed = np.linalg.norm(motion.positions[frames, which] - points, axis=-1)
-        log.info("control      %s is away by %s", joint, far(missed))
-    scene = player.Scene([player.Character(motion, name=name)], title=title, boundaries=boundaries)
+        log.info("control      %s is away by %s", joint, far(made.missed))
+    shown = player.Character(made.motion, name=name)
+    scene = player.Scene([shown], title=made.motion.name, boundaries=made.boundaries)
     _write_shown(targets, scene, trained)
 
 

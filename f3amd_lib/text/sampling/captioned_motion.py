@@ -4,14 +4,17 @@ What a user asks for is checked here, once; `text.sampling.text_to_motion` has t
 """
 
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from f3amd_lib.ground.names import nearest_hint
+from f3amd_lib.motion.inverse_kinematics import fitted
 from f3amd_lib.motion.root_paths import read_points_csv
 from f3amd_lib.motion.rotations import matrix_from_yaw
+from f3amd_lib.motion.skeleton import Motion
 from f3amd_lib.text.data.redundant import smoothed_yaw
 from f3amd_lib.text.data.text_encoders import check_captions, check_words, embed_captions
 from f3amd_lib.text.data.text_motions import FEWEST_FRAMES, UNIT, frame_mask
@@ -123,6 +126,63 @@ def check_solver(num_steps: int | None, guidance: float | None) -> None:
 
 
 # ------------------------------------------------------------------------------------------------------- what is made
+
+
+class Told(NamedTuple):
+    """What a model made of captions.
+
+    Attributes:
+      motion: bones keep their lengths; its name is what was told.
+      boundaries: frames at which a caption of a stream begins.
+      moved: how far joints were moved for the bones' sake (`inverse_kinematics.fitted`), metres.
+      missed: how far the controlled joint is from each point it was to be at, [K], metres; None without control.
+    """
+
+    motion: Motion
+    boundaries: range
+    moved: np.ndarray
+    missed: np.ndarray | None
+
+
+def animate(
+    trained: TextModel | LatentModel, encoder, captions: Sequence[str], *, seconds: float = 4.0, seed: int = 0,
+    guidance: float | None = None, num_steps: int | None = None, control=None, joint: str = "pelvis",
+    any_words: bool = False,
+) -> Told:  # fmt: skip
+    """Animate one caption, or several as a stream: what `f3amd text` does.
+
+    Args:
+      trained, encoder, captions, any_words: as for `told_captions`.
+      seconds: of each caption.
+      seed: of the noise.
+      guidance, num_steps: as for `draw_motions`.
+      control: CSV file, see `read_control_csv`: where a joint should be.
+      joint: see `find_joint`.
+
+    Raises:
+      ValueError: for what the model cannot do, as the functions above.
+    """
+    check_solver(num_steps, guidance)
+    if isinstance(trained, LatentModel) and (len(captions) > 1 or control):
+        raise ValueError(f"{trained.name} makes whole motions of one caption: leave out --then and --control")
+    pooled = told_captions(trained, encoder, captions, any_words=any_words)
+    key, how = jax.random.key(seed), {"guidance": guidance, "num_steps": num_steps}
+    boundaries, missed = range(0), None
+    if len(captions) > 1 or getattr(trained, "starts", ()):
+        windows, starts = told_windows(trained, seconds), embed_captions(list(trained.starts), encoder).pooled
+        positions = stream_motions(trained, pooled, [windows] * len(captions), key, starts=starts, **how)
+        each = windows * window_frames(trained)
+        boundaries = range(len(positions) - each * len(captions), len(positions), each)
+    else:
+        num_frames = told_frames(trained, seconds)
+        if control is not None:
+            which, (frames, points) = find_joint(trained, joint), read_control_csv(control, num_frames)
+            how["control"] = control_of(trained, which, frames, points, num_frames)
+        positions = draw_motions(trained, pooled, num_frames, key, **how)[0]
+    motion, moved = fitted(Motion.from_positions(trained.skeleton, positions, trained.fps, ", then ".join(captions)))
+    if control is not None:
+        missed = np.linalg.norm(motion.positions[frames, which] - points, axis=-1)
+    return Told(motion, boundaries, moved, missed)
 
 
 def _asked(trained: TextModel, guidance: float | None, num_steps: int | None) -> dict:
