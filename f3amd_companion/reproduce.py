@@ -83,11 +83,6 @@ def check_parameters(notebooks: Iterable[Path], names: Collection[str]) -> None:
                 raise ValueError(f"{path.name} has no parameter {name!r}{nearest_hint(name, known)}")
 
 
-def _news(path: Path, seconds: float, wrote: str = "") -> str:
-    """Put into one line what a notebook took and wrote."""
-    return f"{path.stem:24s} {f'{seconds:.0f} s' if seconds < 90 else f'{seconds / 60:.1f} min':>11s}{wrote}"
-
-
 def _wrote(folder: Path, start: float) -> str:
     """Say how many files of each kind were written since a moment; records beside tables do not count."""
     files = (path for path in folder.rglob("*") if path.suffix not in (".json", ".md") and path.is_file())
@@ -154,27 +149,7 @@ def reproduce(
     check_parameters(selected, parameters)
 
     own_folder, results = runs_dir(dataset, profile), results_dir(dataset, profile)
-    executed_folder = own_folder / "notebooks"
-    executed_folder.mkdir(parents=True, exist_ok=True)
-    rows, failure = [], None
-    with contextlib.ExitStack() as held:  # no other process runs one of them into the same folder
-        for path in selected:
-            held.enter_context(locked(executed_folder / f".{path.stem}.lock", f"running {path.name}"))
-        # Bars are for people: a log file gets the lines of `say` instead.
-        for path in tqdm(selected, desc="notebooks", disable=None):
-            began, start = time.time(), time.monotonic()
-            try:
-                _execute(path, executed_folder / path.name, parameters)
-            except NotebookFailed as error:
-                failure = error
-            seconds = time.monotonic() - start
-            cells = sum(cell.cell_type == "code" for cell in nbformat.read(path, as_version=4).cells)
-            finished = failure is None
-            rows.append({"notebook": path.name, "seconds": round(seconds, 1), "cells": cells, "finished": finished})
-            if failure:
-                break
-            say(_news(path, seconds, _wrote(results, began)))
-
+    rows, failure = _run_each(selected, own_folder / "notebooks", parameters, say, lambda began: _wrote(results, began))
     summary = pd.DataFrame(rows)
     # Only now: the record asks JAX for its devices, and a process that holds a GPU would have kept
     # its memory from the notebooks.
@@ -206,17 +181,35 @@ def run_course(only: Iterable[str] = (), *, say: Callable[[str], None] = lambda 
       NotebookFailed: if a notebook stops.
     """
     root = profiles.repository_root()
-    copies = {path: root / "runs/course" / path.name for path in find_notebooks(root / "notebooks/course", only)}
-    (root / "runs/course").mkdir(parents=True, exist_ok=True)
-    for path, copy in copies.items():
-        start = time.monotonic()
-        _execute(path, copy, {})
-        say(_news(path, time.monotonic() - start))
-    return list(copies.values())
+    rows, failure = _run_each(find_notebooks(root / "notebooks/course", only), root / "runs/course", {}, say)
+    if failure:
+        raise failure
+    return [root / "runs/course" / row["notebook"] for row in rows]
 
 
-def _execute(path: Path, copy: Path, parameters: Mapping) -> None:
-    """Run one notebook into a copy; where it fails, write a log beside the copy and say so."""
+def _run_each(notebooks: list[Path], folder: Path, parameters: Mapping, say, wrote=lambda began: ""):
+    """Run notebooks into copies until one fails; return a row of the summary each, and the failure or None."""
+    folder.mkdir(parents=True, exist_ok=True)
+    rows, failure = [], None
+    with contextlib.ExitStack() as held:  # no other process runs one of them into the same folder
+        for path in notebooks:
+            held.enter_context(locked(folder / f".{path.stem}.lock", f"running {path.name}"))
+        # Bars are for people: a log file gets the lines of `say` instead.
+        for path in tqdm(notebooks, desc="notebooks", disable=None):
+            began = time.time()
+            failure = _execute(path, folder / path.name, parameters)
+            seconds, finished = time.time() - began, failure is None
+            cells = sum(cell.cell_type == "code" for cell in nbformat.read(path, as_version=4).cells)
+            rows.append({"notebook": path.name, "seconds": round(seconds, 1), "cells": cells, "finished": finished})
+            if failure:
+                break
+            took = f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.1f} min"
+            say(f"{path.stem:24s} {took:>11s}{wrote(began)}")
+    return rows, failure
+
+
+def _execute(path: Path, copy: Path, parameters: Mapping) -> NotebookFailed | None:
+    """Run one notebook into a copy; where it fails, write a log beside the copy and return what to say."""
     log = copy.with_suffix(".log")
     log.unlink(missing_ok=True)  # an old log beside a good copy would mislead
     try:
@@ -231,7 +224,7 @@ def _execute(path: Path, copy: Path, parameters: Mapping) -> None:
             extra_arguments=["--log-level=CRITICAL"],
             progress_bar={"desc": path.stem, "position": 1, "leave": False, "disable": None},
         )
-        return
+        return None
     except PapermillExecutionError as error:
         number, source, cause, trace = error.exec_count, error.source, f"{error.ename}: {error.evalue}", str(error)
     except DeadKernelError as error:
@@ -242,7 +235,7 @@ def _execute(path: Path, copy: Path, parameters: Mapping) -> None:
         trace = f"{source}\n{cause}\n"
     log.write_text(trace, encoding="utf-8")
     first_line = source.strip().split("\n")[0]
-    raise NotebookFailed(
+    return NotebookFailed(
         f"{path.name} stopped in cell In [{number}], {first_line!r}\n  {cause}\n"
         f"  log: {_short(log)}\n  executed so far: {_short(copy)}"
     )
