@@ -211,8 +211,7 @@ class Model:
 
     def load(self):
         """Load the model, and say what it is."""
-        file = self.file
-        return _say_model(checkpoints.load_model(file))
+        return _say_model(checkpoints.load_model(self.file))
 
     def generator(self):
         """Return what animates characters with the model."""
@@ -549,19 +548,19 @@ def export(
       out: folder to write to.
     """
     terminal.check_writable(out)
+    how = {"num_steps": model.steps, "overwrite": model.overwrite}
     if "onnx" in target:
         if len(target) > 1 or model.sampler:
             raise ValueError("--target onnx goes alone, and without --sampler: what is exported is one evaluation")
         trained = (model.weights and onnx_export.load_text_or_latent(model.weights)) or model.load()
-        how = {"batch": characters, "weights": stored}
-        made = onnx_export.export_onnx(trained, out, num_steps=model.steps, overwrite=model.overwrite, **how)
+        made = onnx_export.export_onnx(trained, out, batch=characters, weights=stored, **how)
     else:
         if not target and importlib.util.find_spec("iree"):
             target = ("llvm-cpu",)
         elif not target:
             log.info("not compiled for this processor, since IREE is missing: make bench-tools")
-        how = {"batch": 1 if characters is None else characters, "sampler": model.sampler, "targets": target}
-        made = exports.export_model(model.load(), out, num_steps=model.steps, overwrite=model.overwrite, **how)
+        batch = 1 if characters is None else characters
+        made = exports.export_model(model.load(), out, batch=batch, sampler=model.sampler, targets=target, **how)
     _say_written(*sorted(made.iterdir()))
 
 
