@@ -192,9 +192,9 @@ def _make_published(folder: Path) -> None:
 
 
 def _read_published(folder: Path) -> None:
-    from f3amd_companion.measuring.published import published_arrays
+    from f3amd_lib.text.released import released_arrays
 
-    published_arrays(folder / "a.safetensors")
+    released_arrays(folder / "a.safetensors")
 
 
 READERS = {

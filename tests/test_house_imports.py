@@ -18,7 +18,7 @@ HOUSES = {"f3amd_lib": ROOT, "f3amd_companion": ROOT, "f3amd_notebooks": ROOT / 
 
 ROOMS = {
     "f3amd_lib": "ground motion data diffusion networks training rollout measures drawing papers",
-    "f3amd_lib.text": "data networks phases stages judge sampling",
+    "f3amd_lib.text": "data networks phases stages judge sampling released",
     "f3amd_companion": "serving speed measuring ledger reproduce terminal __main__",
 }
 """From the ground up: a room knows itself and those before it."""

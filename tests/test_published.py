@@ -1,4 +1,6 @@
-"""CAMDM's published weights: names and shapes of the release, with random numbers in them."""
+"""Published weights: names and shapes of the releases, with random numbers in them."""
+
+import types
 
 import jax
 import numpy as np
@@ -8,7 +10,6 @@ from flax import nnx
 from safetensors.numpy import save_file
 from scipy.special import erf
 
-from f3amd_companion.measuring.published import PublishedFeatures, published_arrays, published_model, published_network
 from f3amd_lib.data.features import path_condition, split_frames
 from f3amd_lib.data.packed import packed_dataset
 from f3amd_lib.data.sources import open_dataset
@@ -16,6 +17,7 @@ from f3amd_lib.motion.root_paths import named_path
 from f3amd_lib.motion.rotations import matrix_from_rotation_6d, matrix_from_yaw, rotation_6d_from_matrix
 from f3amd_lib.networks.conditioning import Condition
 from f3amd_lib.rollout.rollout import MotionGenerator
+from f3amd_lib.text.released import ReleasedFeatures, read_released, released_arrays
 
 HEADS = 4
 
@@ -96,8 +98,20 @@ def by_hand(arrays, x, step, past, trans, pose, style):
     return apply("output_process.poseFinal", z[-len(x) :])
 
 
-def test_the_released_shape_has_the_released_number_of_parameters():
-    network = published_network(released())
+def camdm(arrays, folder):
+    """The network of arrays, on data of its joints and styles without a clip."""
+    path = folder / "camdm.safetensors"
+    save_file(arrays, path)
+    joints, styles = len(arrays["output_process.poseFinal.bias"]) // 6 - 1, len(arrays["embed_style.action_embedding"])
+    data = types.SimpleNamespace(
+        skeleton=types.SimpleNamespace(num_joints=joints), styles=tuple(f"{number:03}" for number in range(styles)),
+        clip_style=np.array([]), name="", licence="", credit="",
+    )  # fmt: skip
+    return read_released(path, "camdm", packed=data).network()
+
+
+def test_the_released_shape_has_the_released_number_of_parameters(tmp_path):
+    network = camdm(released(), tmp_path)
     assert sum(leaf.size for leaf in jax.tree.leaves(nnx.state(network, nnx.Param))) == 3_439_260
     config = network.config
     assert (config.channels, config.window, config.num_history, config.num_tokens) == (156, 45, 10, 147)
@@ -107,9 +121,9 @@ def test_the_released_shape_has_the_released_number_of_parameters():
 
 
 @pytest.mark.parametrize("step", [0, 2, 3])
-def test_it_computes_what_the_released_forward_pass_computes(step):
+def test_it_computes_what_the_released_forward_pass_computes(step, tmp_path):
     arrays = released(joints=3, styles=5, width=16, depth=2, hidden=32, seed=step)
-    network = published_network(arrays)
+    network = camdm(arrays, tmp_path)
     rng = np.random.default_rng(step)
     x, past = rng.normal(size=(45, 24)), rng.normal(size=(10, 24))
     trans, pose = rng.normal(size=(45, 2)), rng.normal(size=(45, 6))
@@ -130,7 +144,7 @@ def test_frames_and_paths_are_turned_into_rows_and_back():
     turned = matrix_from_rotation_6d(rng.normal(size=(4, 3, 6)))
     root = rng.normal(size=(4, 3))
     frames = np.concatenate([root, np.asarray(rotation_6d_from_matrix(turned)).reshape(4, -1)], axis=-1)
-    features = PublishedFeatures()
+    features = ReleasedFeatures()
     x = np.asarray(features.normalise(frames))
     np.testing.assert_allclose(x[:, :6], turned[:, 0, :2].reshape(4, 6), atol=1e-6)
     np.testing.assert_allclose(x[:, -6:], np.concatenate([root, 0 * root], axis=-1), atol=1e-6)
@@ -148,30 +162,32 @@ def packed():
 def test_a_published_network_walks_on_the_data_it_knows(packed, tmp_path):
     arrays = released(packed.skeleton.num_joints, len(packed.styles), width=16, depth=1, hidden=32)
     save_file(arrays, tmp_path / "camdm.safetensors")
-    trained = published_model(tmp_path / "camdm.safetensors", packed)
+    trained = read_released(tmp_path / "camdm.safetensors", "camdm", packed=packed)
     path = named_path("straight", 90, speed=1.0)
     made = MotionGenerator(trained, 4).rollout(path, packed.styles[1])
     assert made.frames.shape == (1, 90, split_frames(made.frames)[1].shape[-2] * 6 + 3)
     assert np.isfinite(made.motion().positions).all()
     with pytest.raises(ValueError, match="25 joints in 100 styles"):
         save_file(released(width=16, depth=1, hidden=32), tmp_path / "other.safetensors")
-        published_model(tmp_path / "other.safetensors", packed)
+        read_released(tmp_path / "other.safetensors", "camdm", packed=packed)
 
 
 def test_a_file_that_is_damaged_or_missing_is_refused_by_name(tmp_path):
     path = tmp_path / "arrays.safetensors"
-    refused("arrays.safetensors: not a whole file of arrays", published_arrays, path)
+    refused("arrays.safetensors: not a whole file of arrays", released_arrays, path)
     save_file({"a": np.ones((3, 4), np.float32)}, path)
-    np.testing.assert_array_equal(published_arrays(path)["a"], 1.0)
+    np.testing.assert_array_equal(released_arrays(path)["a"], 1.0)
     whole = path.read_bytes()
     for damaged in (whole[:-7], b""):
         path.write_bytes(damaged)
-        refused("arrays.safetensors: not a whole file of arrays", published_arrays, path)
-    refused("pickle", published_arrays, tmp_path / "best.pt")
+        refused("arrays.safetensors: not a whole file of arrays", released_arrays, path)
+    refused("pickle", released_arrays, tmp_path / "best.pt")
 
 
-def test_what_is_no_release_is_refused():
+def test_what_is_no_release_is_refused(tmp_path):
     small = released(joints=3, styles=5, width=16, depth=1, hidden=32)
     lacking = {name: array for name, array in small.items() if not name.endswith("norm1.bias")}
-    refused("has no array 'seqEncoder.layers.0.norm1.bias'", published_network, lacking)
-    refused("must have the shape", published_network, small | {"output_process.poseFinal.bias": np.zeros(7)})
+    refused("has no array 'seqEncoder.layers.0.norm1.bias'", camdm, lacking, tmp_path)
+    misshapen = small | {"output_process.poseFinal.weight": np.zeros((7, 16), np.float32)}
+    refused("output_process.poseFinal.weight must have the shape", camdm, misshapen, tmp_path)
+    refused("has an array 'x.weight' that", camdm, small | {"x.weight": np.zeros(7, np.float32)}, tmp_path)

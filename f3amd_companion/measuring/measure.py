@@ -26,8 +26,6 @@ import pandas as pd
 
 from f3amd_companion.measuring import sensitivity
 from f3amd_companion.measuring.consistency_task import STUDENT_SPACING, TEACHER_STEPS, distil
-from f3amd_companion.measuring.published import NAME as PUBLISHED
-from f3amd_companion.measuring.published import published_model
 from f3amd_companion.measuring.runner import Records, records_folder
 from f3amd_companion.measuring.times import Candidate, time_group
 from f3amd_companion.serving.foot_locking import lock_rollout
@@ -51,8 +49,10 @@ from f3amd_lib.measures.real_clips import reference_clips, style_floor
 from f3amd_lib.measures.walking import walking_figures
 from f3amd_lib.motion.skeleton import Motion
 from f3amd_lib.motion.synthetic import walk_along
+from f3amd_lib.papers.printed import PUBLISHED_CAMDM
 from f3amd_lib.rollout.blending import blend_rollout
 from f3amd_lib.rollout.rollout import MotionGenerator
+from f3amd_lib.text.released import read_released
 from f3amd_lib.training.checkpoints import TrainedModel
 from f3amd_lib.training.pipeline import PreparedData, available_models, obtain_model
 from f3amd_lib.training.recipe import profile_recipe
@@ -169,7 +169,7 @@ def measure_quality(
     """Run the evaluation protocol: real and broken motion, and models at 8, 4, 2 and 1 steps.
 
     See `measures.protocol`. A row takes about a minute on 2 cores; its seconds are in the table.
-    `published` is the file of CAMDM's published weights (`measuring.published`), measured beside them.
+    `published` is the file of CAMDM's published weights (`text.released`), measured beside them.
 
     Returns:
       The table of means and intervals, `records/quality.csv`; beside it `quality_by_seed.csv` and
@@ -180,7 +180,7 @@ def measure_quality(
     held_out = prepared.windows(prepared.held_out_split)
     trained = _models(prepared, profile, models)
     if published is not None:
-        trained[PUBLISHED] = published_model(published, packed)
+        trained[PUBLISHED_CAMDM] = read_released(published, "camdm", packed=packed)
     if not trained:
         where = profile.dataset, profile.name
         log.warning("no trained model of %s at %s: only real motion is measured; name models with --model", *where)
