@@ -35,7 +35,7 @@ from f3amd_lib.text.data.text_motions import AxisNormaliser
 from f3amd_lib.text.judge.text_judge import TextJudge
 from f3amd_lib.text.networks.acmdm import blank_branch
 from f3amd_lib.text.stages.motionpcm_training import LatentMotionTraining
-from f3amd_lib.text.stages.text_models import CONTROL, LatentModel, MotionCodec, TextModel
+from f3amd_lib.text.stages.text_models import CONTROL, JUDGE, LatentModel, MotionCodec, TextModel
 from f3amd_lib.training.checkpoints import TrainedModel
 
 _TABLE = read_toml(Path(__file__).with_name("released.toml"))
@@ -184,19 +184,6 @@ def taken_arrays(arrays: Mapping[str, np.ndarray], family: str, sizes: dict[str,
 # -------------------------------------------------------------------------------------------------------------- models
 
 
-def _config(told: dict, part: str, preset: presets.Preset | None, sizes: dict, **settings) -> CheckedConfig:
-    """Return the config of a part of a model: the preset's, with the sizes that the arrays have."""
-    if part == "autoencoder" and preset.latent:
-        preset = presets.find_preset(preset.latent)
-    for field, size in told["sizes"][part].items():
-        numerator, _, denominator = size.partition("/")
-        settings[field] = sizes[numerator] // sizes.get(denominator, 1)
-    network = preset.network if preset else {"released": True}
-    return presets.config_from_dict({
-        "family": preset.family if preset else told["network"], **network, **told.get("settings", {}), **settings
-    })  # fmt: skip
-
-
 def _params(shapes, made: Mapping[str, np.ndarray], part: str, where) -> Any:
     """Return weights in the shapes of one network, of arrays by our names."""
     leaves, tree = jax.tree_util.tree_flatten_with_path(shapes)
@@ -224,6 +211,30 @@ def _statistics(folder, names: tuple[str, str], width: int) -> AxisNormaliser:
     return AxisNormaliser(found[0], np.maximum(found[1], 1e-8))
 
 
+def released_parts(arrays: Mapping[str, np.ndarray], family: str, preset: str = "", *, layout="humanml3d", where=""):
+    """Return (config of each network by part, arrays by our names) of a release; arguments, errors: `read_released`."""
+    told = FAMILIES[family]
+    base = preset.partition(CONTROL)[0] or told.get("preset")
+    found = base and presets.find_preset(base)
+    sizes = {size: found.network.get(field, usual) for size, (field, usual) in told.get("known", {}).items()}
+    made, joints, settings = taken_arrays(arrays, family, sizes, where), layout_skeleton(layout).num_joints, {}
+    if "P" in sizes:
+        patches = {joints: "whole", -(-joints // 2): "half", 2: "pair"}
+        if sizes["P"] not in patches:
+            raise ValueError(f"{where}: has patches of {sizes['P']} joints; of {layout}'s it may be {[*patches]}")
+        settings = {"num_joints": joints, "patch": patches[sizes["P"]]}
+    configs = {}
+    for part, fields in told["sizes"].items():
+        for field, size in fields.items():
+            numerator, _, denominator = size.partition("/")
+            settings[field] = sizes[numerator] // sizes.get(denominator, 1)
+        own = presets.find_preset(found.latent) if part == "autoencoder" and found.latent else found
+        usual = {"family": own.family, **own.network} if own else {"family": told["network"], "released": True}
+        configs[part] = presets.config_from_dict({**usual, **told.get("settings", {}), **settings})
+        settings = {}
+    return configs, made
+
+
 def read_released(
     path, family: str, *, preset: str = "", statistics=None, autoencoder=None, encoder: TextEncoder | None = None,
     packed: PackedMotion | None = None, layout: str = "humanml3d",
@@ -249,33 +260,17 @@ def read_released(
     """
     check_known(family, FAMILIES, "family of released weights")
     check_known(layout, LAYOUTS, "layout")
-    told = FAMILIES[family]
-    base, plus, branch = (preset or told.get("preset", "")).partition(CONTROL)
-    found = presets.find_preset(base) if base else None
-    sizes = {size: found.network.get(field, usual) for size, (field, usual) in told.get("known", {}).items()}
-    made = taken_arrays(released_arrays(path), family, sizes, path)
-    skeleton, configs = layout_skeleton(layout), {}
-    for part in told["sizes"]:
-        settings = {}
-        if "P" in sizes:
-            joints = skeleton.num_joints
-            patches = {joints: "whole", -(-joints // 2): "half", 2: "pair"}
-            if sizes["P"] not in patches:
-                raise ValueError(
-                    f"{path}: has patches of {sizes['P']} joints, of {layout}'s {joints} one of {[*patches]}"
-                )
-            settings = {"num_joints": joints, "patch": patches[sizes["P"]]}
-        configs[part] = _config(told, part, found, sizes, **settings)
+    told, branch = FAMILIES[family], preset.partition(CONTROL)[1:]
+    found = presets.find_preset(base) if (base := preset.partition(CONTROL)[0] or told.get("preset")) else None
+    configs, made = released_parts(released_arrays(path), family, preset, layout=layout, where=path)
     config, coder = configs.get("params"), configs.get("autoencoder")
     params = {part: _params(presets.blank_network(one)[1], made, part, path) for part, one in configs.items()}
     about = {"config": config, "params": params.get("params"), "record": _record(told, family, path, layout, found)}
     if family == "camdm":
         return _camdm(path, packed, **about)
-    about |= {"name": _name_of(found, config or coder), "skeleton": skeleton, "fps": LAYOUTS[layout]["fps"]}
-    about |= {
-        "text_encoder": encoder.identity if encoder else "",
-        "schedule": found.diffusion if found and config else None,
-    }
+    about |= {"skeleton": layout_skeleton(layout), "fps": LAYOUTS[layout]["fps"]}
+    about |= {"text_encoder": encoder.identity if encoder else "", "name": _name_of(found, config or coder)}
+    about |= {"schedule": found.diffusion} if found and config else {}
     normaliser = lambda what, width: _statistics(statistics, told["statistics"][what], width)
     if found is None:
         return TextJudge(normaliser=normaliser("frames", config.features), **about)
@@ -293,7 +288,7 @@ def read_released(
         codec = read_released(autoencoder, coders[found.latent], statistics=statistics, layout=layout).codec
         codec = dataclasses.replace(codec, latent=normaliser("latent", config.channels))
     if "c_x_embedder.*" in told["arrays"]:
-        about["name"] += plus + branch or CONTROL
+        about["name"] += "".join(branch) or CONTROL
         about["branch"] = _params(blank_branch(config, codec.frames_per_state)[1], made, "branch", path)
     return TextModel(codec=codec, **about)
 
@@ -301,7 +296,7 @@ def read_released(
 def _name_of(preset: presets.Preset | None, config: CheckedConfig) -> str:
     """Return the name of the preset that has a config, of the same family and latent; else the given one's."""
     if preset is None:
-        return "judge"
+        return JUDGE
     given = {field: getattr(config, field) for field in config.from_data}
     alike = [one for one in presets.PRESETS.values() if (one.family, one.latent) == (preset.family, preset.latent)]
     same = [one.name for one in alike if presets.build_config(one.name, **given) == config]
