@@ -218,6 +218,24 @@ class Model:
         return rollouts.MotionGenerator(self.load(), self.steps, sampler=self.sampler)
 
 
+@dataclass(frozen=True)
+class Encoder:
+    """What embeds captions.
+
+    Attributes:
+      text_encoder: wordllama (offline), clip or t5, of models of text to motion.
+      text_weights: folder of CLIP's or Sentence-T5's weights, as `transformers` keeps them.
+    """
+
+    text_encoder: Literal["wordllama", "clip", "t5"] = "wordllama"
+    text_weights: Path | None = None
+
+    def load(self):
+        """Read its weights, and return it."""
+        terminal.check_there(self.text_weights)
+        return text_encoders.load_text_encoder(self.text_encoder, self.text_weights)
+
+
 def joints(file: Positional[Path], person: Person) -> None:
     """Show which joint of a BVH file plays which role, and what is corrected on reading.
 
@@ -302,7 +320,7 @@ def presets(
 def train(
     motion: Data, preset: Repeatable = (), minutes: float | None = None, steps: int | None = None,
     batch_size: int | None = None, seed: int | None = None, out: Path | None = None, all_devices: bool = False,
-    teacher: Path | None = None,
+    teacher: Path | None = None, captions: Encoder = Encoder(),
 ) -> int:  # fmt: skip
     """Train a model; a killed run goes on where it stopped.
 
@@ -328,7 +346,7 @@ def train(
     if of_latents or any(name == "judge" or "ACMDM" in name for name in preset):
         if all_devices:
             raise ValueError("models of captioned motion train on one device: leave --all-devices out")
-        files, train_one = _text_trainings(motion, preset, steps, own, teacher, **leg)
+        files, train_one = _text_trainings(motion, captions, preset, steps, own, teacher, **leg)
     else:
         prepared, profile = motion.open(train_steps=steps, **own)
         leg["mesh"] = optimise.all_devices() if all_devices else None
@@ -345,13 +363,13 @@ def train(
     return 0
 
 
-def _text_trainings(motion: Data, names, steps, own: dict, teacher, *, folder, stop_at):
+def _text_trainings(motion: Data, captions: Encoder, names, steps, own: dict, teacher, *, folder, stop_at):
     """Return the files of models of text to motion, or of their judge, by name, and what trains the one of a name."""
     for name in names:
         if name != text_models.JUDGE:
             train_stage.stage_of(name)  # refuses those that need no captions
     profile = motion.numbers(train_steps=steps, **own)
-    given = text_models.open_text_motions(motion.data, motion.source), text_encoders.load_text_encoder()
+    given = text_models.open_text_motions(motion.data, motion.source), captions.load()
     files = {name: text_models.text_model_files(profile, name, folder=folder) for name in names}
 
     def train_one(name: str):
@@ -610,7 +628,7 @@ def bench(
 
 def measure(
     names: Positional[tuple[str, ...]] = (), *, motion: Data, model: Repeatable = (), published: Path | None = None,
-    minutes: float | None = None,
+    minutes: float | None = None, captions: Encoder = Encoder(),
 ) -> int:  # fmt: skip
     """Measure what notebooks only draw; tables go to <results>/records/.
 
@@ -628,7 +646,7 @@ def measure(
         if len(of_text) < len(names):
             raise ValueError(f"{', '.join(of_text)}: measure text to motion by a call of its own")
         profile, how = motion.numbers(), {"models": model, "stop_at": _stop_at(minutes)}
-        given = text_models.open_text_motions(motion.data, motion.source), text_encoders.load_text_encoder(), profile
+        given = text_models.open_text_motions(motion.data, motion.source), captions.load(), profile
         measurements = text_tables.TEXT_MEASUREMENTS
     else:
         models = [network_presets.find_preset(name).name for name in model] or None

@@ -61,7 +61,7 @@ def test_the_command_on_a_text_card_asks_for_the_training_that_its_record_tells(
     monkeypatch.setattr(train_stage.STAGES["ACMDM"], "of", begin)
     walks = captioned_walks(synthetic.STYLES[:1], ("train",), num_frames=40)
     monkeypatch.setattr(text_models, "open_text_motions", lambda *asked: walks)
-    monkeypatch.setattr(text_encoders, "load_text_encoder", lambda: None)
+    monkeypatch.setattr(text_encoders, "load_text_encoder", lambda *_: None)
     path = PRETRAINED_DIR / "bandai" / "text" / "ACMDM-S-PS22-raw-n3.safetensors"
     command = re.search(r"^f3amd (train .*)$", path.with_suffix(".md").read_text(encoding="utf-8"), re.MULTILINE)[1]
     with pytest.raises(Asked) as asked:

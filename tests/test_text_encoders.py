@@ -7,6 +7,7 @@ import warnings
 import numpy as np
 import pytest
 
+from f3amd_companion.__main__ import main
 from f3amd_lib.text.data import text_encoders
 from f3amd_lib.text.data.text_encoders import TextEmbeddings, check_words, embed_captions, load_text_encoder
 
@@ -43,6 +44,20 @@ def test_what_was_embedded_is_not_embedded_again(cache_dir):
     for file in cache_dir.iterdir():
         file.write_bytes(file.read_bytes()[:50])
     assert np.array_equal(embed_captions(captions, encoder).tokens, first.tokens) and encoder.calls == 3
+
+
+def test_encoders_of_unlike_weights_do_not_share_what_they_embedded(cache_dir):
+    other = Letters()
+    other.identity = "letters-of-another-folder"
+    for encoder in (Letters(), other):
+        embed_captions(["ab", "abcd"], encoder)
+        assert encoder.calls == 1
+
+
+def test_training_and_measuring_take_an_encoder_by_name(tmp_path, capsys):
+    for words in (["train", "--preset", "judge"], ["measure", "text_judge"]):
+        assert main([*words, "--data", "bandai", "--text-encoder", "t5", "--text-weights", str(tmp_path)]) == 2
+        assert f"t5: {tmp_path / 'config.json'} is missing" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

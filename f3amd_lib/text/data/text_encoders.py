@@ -165,7 +165,7 @@ def _load_transformers(kind: str, folder) -> TextEncoder:
     folder = Path(folder or "").expanduser()
     needed = [folder / "config.json", *([folder / "2_Dense" / "model.safetensors"] if kind == "t5" else [])]
     if missing := [path for path in needed if not path.is_file()]:
-        raise ValueError(f"{kind}: {missing[0]} is missing; give the folder of its weights (save_pretrained)")
+        raise ValueError(f"{kind}: {missing[0]} is missing; give the folder of its weights (--text-weights)")
     if importlib.util.find_spec("transformers") is None or importlib.util.find_spec("torch") is None:
         raise ImportError(f"the text encoder {kind} needs transformers and torch: make bench-tools")
     import torch
