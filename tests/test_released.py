@@ -1,5 +1,7 @@
 """Weights of ACMDM, MotionLCM and the evaluators: released names and shapes, and PyTorch's definitions in numpy."""
 
+import pickle
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +11,10 @@ from safetensors.numpy import save_file
 from scipy.special import erf, expit
 
 from f3amd_lib.networks.presets import blank_network, count_parameters
+from f3amd_lib.text.data.humanml3d import tagged_captions
+from f3amd_lib.text.data.redundant import canonical_start, redundant_from_positions
+from f3amd_lib.text.data.text_encoders import TextEmbeddings, embed_captions, load_glove
+from f3amd_lib.text.data.text_motions import going_on
 from f3amd_lib.text.networks import acmdm
 from f3amd_lib.text.released import FAMILIES, read_released, released_parts
 from f3amd_lib.text.stages.text_models import load_text_model, save_text_model
@@ -110,6 +116,16 @@ def evaluator_shapes(features=263 - 4, m=512, motion=1024, text=512, word=300, t
     return found | recurrence("motion_encoder", m, motion, out) | recurrence("text_encoder", word, text, out)
 
 
+def clip_shapes(d=512, f=1024, features=67, depth=8, words=49408, out=512):
+    found = {"logit_scale": (), "motion_encoder.sequence_pos_encoder.pe": (2000, d), "positional_embedding": (77, d)}
+    found |= {"motion_encoder.query_token": (1, d), "token_embedding.weight": (words, d)}
+    found |= layers("motion_encoder", embed_motion=(d, features), out_ln=(d,), out=(out, d))
+    for number in range(depth):
+        found |= transformer_block(f"motion_encoder.transformer.layers.{number}", d, f)
+        found |= transformer_block(f"textTransEncoder.layers.{number}", d, f)
+    return found | layer("text_ln", d) | layer("out", out, d)
+
+
 SMALL = {
     "acmdm-autoencoder": autoencoder_shapes(4),
     "acmdm-vae": autoencoder_shapes(4, 8),
@@ -121,6 +137,7 @@ SMALL = {
     "motionlcm-student": motionlcm_shapes(8, 12, 263, 3, 4, 6, 10),
     "evaluator": evaluator_shapes(259, 6, 5, 7, 9, 3, 4),
     "acmdm-evaluator": evaluator_shapes(67, 6, 5, 7, 9, 3, 4),
+    "acmdm-clip-evaluator": clip_shapes(16, 12, 67, 2, 11, 5),
 }
 """Each family but CAMDM's (`test_published.py`) at a small size."""
 
@@ -160,8 +177,9 @@ MILLIONS = {
     "acmdm B": (acmdm_shapes(12), 130.1),
     "motionlcm-teacher": (motionlcm_shapes(part="teacher"), 8.24),
     "motionlcm-student": (motionlcm_shapes(), 8.44),
+    "acmdm-clip-evaluator": (clip_shapes(), 59.5),
 }
-"""What the fact sheets count, of the network that makes motion."""
+"""Parameters of the network that makes motion, as the fact sheets count them; of the CLIP evaluator by hand."""
 
 
 @pytest.mark.parametrize("which", MILLIONS)
@@ -452,3 +470,61 @@ def test_the_evaluator_computes_what_the_released_one_does(folder):
     single = lambda x: jnp.asarray(x, jnp.float32)[None]
     found = network.embed_text(single(words), jnp.ones((1, 5), bool), single(tags))
     close(found[0], torch.recurrence("text_encoder", words + torch.linear("text_encoder.pos_emb", tags)))
+
+
+def test_the_evaluator_of_the_clip_score_computes_what_the_released_one_does(folder):
+    judge, torch = read(folder, "acmdm-clip-evaluator"), Torch(random_arrays(SMALL["acmdm-clip-evaluator"]))
+    rng = np.random.default_rng(6)
+    motion = rng.normal(size=(8, 67))
+    x = np.concatenate(
+        [torch.arrays["motion_encoder.query_token"], torch.linear("motion_encoder.embed_motion", motion)]
+    )
+    angle = np.arange(9)[:, None] * 10000.0 ** (-np.arange(0, 16, 2) / 16)
+    x = x + np.stack([np.sin(angle), np.cos(angle)], axis=-1).reshape(9, 16)
+    for number in range(2):
+        x = torch.block(f"motion_encoder.transformer.layers.{number}", x, 8)
+    wanted = torch.linear("motion_encoder.out", torch.layer_norm("motion_encoder.out_ln", x[0]))
+    close(judge.embed_vectors([motion * judge.normaliser.deviation + judge.normaliser.mean])[0], wanted)
+    pieces = [9, 3, 4, 10]
+    x = torch.arrays["token_embedding.weight"][[*pieces, *[0] * 73]] + torch.arrays["positional_embedding"]
+    for number in range(2):
+        x = torch.block(f"textTransEncoder.layers.{number}", x, 8)
+    told = TextEmbeddings(np.array(pieces, np.float32)[None, :, None], np.ones((1, 4), bool), None)
+    close(judge.embed_texts(told)[0], torch.linear("out", torch.layer_norm("text_ln", x[3])))
+
+
+# ------------------------------------------------------------------------------------------ words with tags
+
+
+def test_words_are_glove_vectors_with_their_part_of_speech(folder, tmp_path, cache_dir):
+    words = ["sos", "eos", "unk", "a", "person", "walk"]
+    vectors = np.random.default_rng(7).normal(size=(6, 9)).astype(np.float32)
+    np.save(tmp_path / "our_vab_data.npy", vectors)
+    (tmp_path / "our_vab_idx.pkl").write_bytes(pickle.dumps({word: row for row, word in enumerate(words)}))
+    (tmp_path / "texts").mkdir()
+    lines = "A person’s walk#a/DET person/NOUN walk/NOUN zigzag/ADV#0.0#0.0\nbroken\n"
+    (tmp_path / "texts" / "1.txt").write_text(lines, encoding="utf-8")
+    encoder = load_glove(tmp_path, tagged_captions(tmp_path))
+    embedded = embed_captions(["A person’s walk"], encoder)
+    np.testing.assert_array_equal(embedded.tokens[0, :, :9], vectors[[0, 3, 4, 5, 2, 1]])
+    # A walk is an act, whatever it is called, and what is not known is another word.
+    assert embedded.tokens[0, :, 9:].argmax(axis=-1).tolist() == [14, 2, 1, 12, 14, 14]
+    refused("'a walk' has no tags", embed_captions, ["a walk"], encoder)
+    (tmp_path / "our_vab_idx.pkl").write_bytes(pickle.dumps(np.ones(2)))
+    refused("not the GloVe files", load_glove, tmp_path, {})
+
+
+def test_a_judge_reads_tags_behind_the_numbers_of_a_word(folder):
+    judge, rng = read(folder, "evaluator"), np.random.default_rng(8)
+    tokens, mask = rng.normal(size=(2, 5, 12)).astype(np.float32), np.arange(5) < np.array([[5], [3]])
+    wanted = judge.network().embed_text(*map(jnp.asarray, (tokens[..., :9], mask, tokens[..., 9:])))
+    close(judge.embed_texts(TextEmbeddings(tokens, mask, None)), wanted)
+
+
+@pytest.mark.parametrize(("family", "width"), [("evaluator", 259), ("acmdm-evaluator", 67)])
+def test_a_judge_looks_at_as_many_numbers_of_a_frame_as_it_was_trained_on(folder, family, width):
+    judge, positions = read(folder, family), np.random.default_rng(9).normal(size=(9, 22, 3))
+    seen = going_on(canonical_start(judge.skeleton, positions))
+    vectors = redundant_from_positions(judge.skeleton, seen)
+    assert judge.config.features == width
+    close(judge.embed_motions([positions]), judge.embed_vectors([vectors]))

@@ -9,7 +9,13 @@ import pytest
 
 from f3amd_companion.__main__ import main
 from f3amd_lib.text.data import text_encoders
-from f3amd_lib.text.data.text_encoders import TextEmbeddings, check_words, embed_captions, load_text_encoder
+from f3amd_lib.text.data.text_encoders import (
+    TextEmbeddings,
+    check_words,
+    embed_captions,
+    load_clip_pieces,
+    load_text_encoder,
+)  # fmt: skip
 
 
 class Letters:
@@ -155,6 +161,26 @@ def test_a_long_caption_is_cut_and_that_is_said_once(wordllama):
             assert cut.mask.sum(axis=1).tolist() == [77, 41]
             assert np.array_equal(cut.tokens[0, :40], whole.tokens[0, :40])
     assert [str(one.message) for one in told] == ["captions of more than 77 word pieces are cut there"]
+
+
+@pytest.mark.needs("tokenizers")
+def test_word_pieces_are_told_by_their_numbers(tmp_path):
+    import tokenizers
+
+    words = {word: number for number, word in enumerate(["<pad>", "<start>", "<end>", "a", "walk"])}
+    tokenizer = tokenizers.Tokenizer(tokenizers.models.WordLevel(words, unk_token="<pad>"))
+    tokenizer.pre_tokenizer = tokenizers.pre_tokenizers.Whitespace()
+    ends = [("<start>", 1), ("<end>", 2)]
+    tokenizer.post_processor = tokenizers.processors.TemplateProcessing(single="<start> $A <end>", special_tokens=ends)
+    tokenizer.save(str(tmp_path / "tokenizer.json"))
+    encoder = load_clip_pieces(tmp_path)
+    embedded = encoder(["a walk", "walk"])
+    assert embedded.tokens[..., 0].tolist() == [[1, 3, 4, 2], [1, 4, 2, 0]] and embedded.mask.sum() == 7
+    with pytest.warns(UserWarning, match="cut there"):
+        cut = encoder(["walk " * 100])
+    assert cut.tokens[0, [0, -1], 0].tolist() == [1, 2] and cut.mask.sum() == 77
+    with pytest.raises(ValueError, match="tokenizer.json: no tokeniser"):
+        load_clip_pieces(tmp_path / "elsewhere")
 
 
 @pytest.mark.needs("transformers", "torch")

@@ -171,7 +171,7 @@ def taken_arrays(arrays: Mapping[str, np.ndarray], family: str, sizes: dict[str,
             known = ", ".join(f"{size} = {number}" for size, number in sizes.items())
             raise ValueError(f"{where}: {name} must have the shape [{', '.join(wanted)}] ({known}), got {array.shape}")
         array = np.asarray(array, np.float32).reshape(axes)
-        if re.search("weight|bias", name.rpartition(".")[2]) and array.ndim > 1:
+        if re.search("weight|bias", name.rpartition(".")[2]) and array.ndim > 1 and not ours.endswith("embedding"):
             array = np.moveaxis(array, (1, 0), (-2, -1))
         joined = re.search(r"[^.]*\|[^.]*|$", ours)[0]
         for role, part in zip(joined.split("|"), np.split(array, joined.count("|") + 1, axis=-1), strict=True):
@@ -229,7 +229,7 @@ def released_parts(arrays: Mapping[str, np.ndarray], family: str, preset: str = 
             numerator, _, denominator = size.partition("/")
             settings[field] = sizes[numerator] // sizes.get(denominator, 1)
         own = presets.find_preset(found.latent) if part == "autoencoder" and found.latent else found
-        usual = {"family": own.family, **own.network} if own else {"family": told["network"], "released": True}
+        usual = {"family": own.family, **own.network} if own else {"family": told["network"]}
         configs[part] = presets.config_from_dict({**usual, **told.get("settings", {}), **settings})
         settings = {}
     return configs, made

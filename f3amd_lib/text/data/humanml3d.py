@@ -29,6 +29,7 @@ from f3amd_lib.ground.left_out import leave_out
 from f3amd_lib.ground.tables import read_text
 from f3amd_lib.motion.skeleton import Skeleton
 from f3amd_lib.text.data.redundant import CONTACT_STEP, positions_from_redundant
+from f3amd_lib.text.data.text_encoders import plain_caption
 from f3amd_lib.text.data.text_motions import HELD_OUT_PERCENT, MOST_FRAMES, TextMotions
 
 log = logging.getLogger("f3amd")
@@ -62,6 +63,13 @@ def read_caption_line(line: str, where: str) -> tuple[str, float, float]:
         form = "caption#words#begin#end, in seconds or 0.0 twice"
         raise ValueError(f"{where}: {line!r} is not {form} ({error}); mend the line") from error
     return caption.strip(), begin, end
+
+
+def tagged_captions(folder) -> dict[str, str]:
+    """Return words with tags, "a/DET person/NOUN walk/VERB", of each caption of a folder's `texts/`, plain letters."""
+    lines = [line for path in sorted(Path(folder).glob("texts/*.txt")) for line in read_text(path).splitlines()]
+    split = [line.split("#") for line in lines]
+    return {plain_caption(parts[0].strip()): parts[1] for parts in split if len(parts) == 4}
 
 
 def read_humanml3d(folder) -> TextMotions:

@@ -5,8 +5,10 @@
 | `wordllama` | a vector a word piece, pooled by their mean | 256 | in its package: works offline |
 | `clip` | CLIP ViT-B/32, the choice of ACMDM | 512 | a folder of yours |
 | `t5` | Sentence-T5 (large), the choice of MotionPCM | 1024, pooled 768 | a folder of yours |
+| `load_glove` | of the published evaluators: a vector a word, and its part of speech | 315 | a folder of yours |
+| `load_clip_pieces` | of the evaluator of ACMDM's CLIP-score: numbers of word pieces | 1 | a folder of yours |
 
-The last two run in PyTorch by way of `transformers`; a folder is that of the published model, with weights
+CLIP and T5 run in PyTorch by way of `transformers`; a folder is that of the published model, with weights
 as safetensors.
 `wordllama` is a mean of word vectors, so that "left hand up, right hand down" and the other way
 round are one to its pooled vector; the token vectors keep their order.
@@ -14,10 +16,11 @@ round are one to its pooled vector; the token vectors keep their order.
 
 import hashlib
 import importlib.util
+import pickletools
 import re
 import warnings
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -25,7 +28,7 @@ from typing import NamedTuple
 import numpy as np
 
 from f3amd_lib.data.packed import cache_folder
-from f3amd_lib.ground.files import whole_file
+from f3amd_lib.ground.files import read_toml, whole_file
 from f3amd_lib.ground.names import check_known, nearest_hint
 
 MOST_TOKENS = 77
@@ -209,6 +212,71 @@ def load_text_encoder(name: str = "wordllama", folder=None) -> TextEncoder:
     """
     check_known(name, ("wordllama", "clip", "t5"), "text encoder")
     return load_wordllama() if name == "wordllama" else _load_transformers(name, folder)
+
+
+def load_glove(folder, tagged: Mapping[str, str]) -> TextEncoder:
+    """Read the GloVe vectors of the published evaluators: 300 numbers a word, then 15 for its part of speech.
+
+    Args:
+      folder: with `our_vab_data.npy` and `our_vab_idx.pkl`; of the latter, a pickle, the operations are listed and
+        none is run.
+      tagged: words with tags, "a/DET person/NOUN walk/VERB", of each caption (`humanml3d.tagged_captions`).
+
+    Raises:
+      ValueError: naming the file that is missing or another one; and, when embedding, a caption without tags.
+    """
+    about, folder = read_toml(Path(__file__).with_name("tags.toml")), Path(folder)
+    try:
+        vectors = np.load(folder / "our_vab_data.npy", allow_pickle=False)
+        operations = list(pickletools.genops((folder / "our_vab_idx.pkl").read_bytes()))
+        said = [what for how, what, _ in operations if "UNICODE" in how.name or how.name.startswith("BININT")]
+        place = dict(zip(said[::2], said[1::2], strict=True))
+        unknown = vectors[place["unk"]]
+    except (OSError, ValueError, LookupError) as error:
+        raise ValueError(f"{folder}: not the GloVe files of the evaluators ({error}); fetch them again") from error
+    special = {word: kind for kind, words in about["words"].items() for word in words.split()}
+    tags = {tag: row for tag, row in zip(about["tags"], np.eye(len(about["tags"])), strict=True)}
+
+    def vector(token):
+        word, _, tag = token.rpartition("/")
+        if word not in place:
+            return np.concatenate([unknown, tags["OTHER"]])
+        return np.concatenate([vectors[place[word]], tags.get(special.get(word, tag), tags["OTHER"])])
+
+    def embed(captions):
+        if missing := [caption for caption in captions if caption not in tagged]:
+            raise ValueError(f"caption {missing[0]!r} has no tags; judge captions of the data set's texts alone")
+        cut = [["sos/OTHER", *tagged[caption].split()[:20], "eos/OTHER"] for caption in captions]
+        pieces = [np.array([vector(token) for token in tokens]) for tokens in cut]
+        return pieces, [piece.mean(axis=0) for piece in pieces]
+
+    digest = hashlib.sha256(vectors.tobytes() + repr(sorted(tagged.items())).encode())
+    return TextEncoder(f"glove-{digest.hexdigest()[:12]}", vectors.shape[1] + len(tags), embed)
+
+
+def load_clip_pieces(folder) -> TextEncoder:
+    """Return captions as numbers of CLIP's word pieces, for the evaluator of ACMDM's CLIP-score.
+
+    Args:
+      folder: with `tokenizer.json` of CLIP ViT-B/16, as `transformers` keeps it.
+
+    Raises:
+      ValueError: naming a file that is missing or of another kind.
+    """
+    from tokenizers import Tokenizer
+
+    path = Path(folder) / "tokenizer.json"
+    try:
+        tokenizer, content = Tokenizer.from_file(str(path)), path.read_bytes()
+    except Exception as error:  # tokenizers raises Exception itself
+        raise ValueError(f"{path}: no tokeniser ({error}); fetch CLIP's folder again") from error
+    tokenizer.enable_truncation(MOST_TOKENS)
+
+    def embed(captions):
+        pieces = [np.array(encoded.ids, np.float32)[:, None] for encoded in tokenizer.encode_batch(list(captions))]
+        return pieces, [piece.mean(axis=0) for piece in pieces]
+
+    return TextEncoder(f"pieces-{hashlib.sha256(content).hexdigest()[:12]}", 1, embed)
 
 
 def embed_captions(captions: Sequence[str], encoder: TextEncoder) -> TextEmbeddings:

@@ -28,7 +28,7 @@ from f3amd_lib.measures.registry import METRICS
 from f3amd_lib.networks.attention import dropout
 from f3amd_lib.networks.config import CheckedConfig, scaled_normal
 from f3amd_lib.text.data import text_motions
-from f3amd_lib.text.data.redundant import canonical_start, essential_features
+from f3amd_lib.text.data.redundant import canonical_start, essential_features, redundant_from_positions
 from f3amd_lib.text.data.text_encoders import TextEmbeddings, TextEncoder, embed_captions
 from f3amd_lib.text.data.text_motions import MOST_FRAMES, UNIT, AxisNormaliser, TextMotions, draw_clips, pad_motions
 from f3amd_lib.text.judge import text_metrics
@@ -310,18 +310,27 @@ class TextJudge(CaptionedModel):
         Raises:
           ValueError: for another number of joints, fewer than 4 frames, or numbers not finite.
         """
+        essential = self.config.features == 4 + 3 * (self.skeleton.num_joints - 1)
+        of = essential_features if essential else redundant_from_positions
         if (least := min(map(len, motions))) < UNIT:
             raise ValueError(f"a motion has {least} frames; the judge needs {UNIT}")
         canonical = (text_motions.going_on(canonical_start(self.skeleton, motion)) for motion in motions)
-        features = [
-            self.normaliser.normalise(essential_features(self.skeleton, motion, released=self.config.released))
-            for motion in canonical
-        ]
+        return self.embed_vectors([of(self.skeleton, motion, released=self.config.released) for motion in canonical])
+
+    def embed_vectors(self, vectors: Sequence[np.ndarray]) -> np.ndarray:
+        """Return motions as vectors, [N, D], of redundant vectors, [L, C] each: what it reads comes first."""
+        features = [self.normaliser.normalise(rows[:, : self.config.features]) for rows in vectors]
         return self._embed("motion", lambda rows: pad_motions([features[row] for row in rows])[:2], len(features))
 
     def embed_texts(self, embedded: TextEmbeddings) -> np.ndarray:
-        """Return embedded captions as vectors, [N, D]."""
-        return self._embed("text", lambda rows: (embedded.tokens[rows], embedded.mask[rows]), len(embedded.tokens))
+        """Return embedded captions as vectors, [N, D]; a token's tag, where it has one, stands behind its numbers."""
+        parts, mask = [self.config.token_width] * bool(self.config.tag_width), embedded.mask
+
+        def given(rows):
+            tokens, *tags = np.split(embedded.tokens[rows], parts, axis=-1)
+            return tokens, mask[rows], *tags
+
+        return self._embed("text", given, len(embedded.tokens))
 
     def _embed(self, what: str, given: Callable, count: int) -> np.ndarray:
         embed = lambda rows: _embed(what, self.config, self.params, *given(rows))

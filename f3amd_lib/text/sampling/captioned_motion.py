@@ -43,7 +43,7 @@ def told_captions(
       trained: the model that will be told.
       encoder: of captions.
       captions: what the person does.
-      any_words: let words through that the model has never seen.
+      any_words: let words through that the model has never seen; of a published model nobody knows them.
 
     Raises:
       ValueError: for a caption that is empty, too long or has unknown words, or another encoder than the model's.
@@ -51,7 +51,7 @@ def told_captions(
     if encoder.identity != trained.text_encoder:
         raise ValueError(f"{trained.name} reads captions of {trained.text_encoder}, not of {encoder.identity}")
     check_captions(captions)
-    if not any_words:
+    if trained.words and not any_words:
         for caption in captions:
             check_words(caption, trained.words)
     return embed_captions(list(captions), encoder).pooled
