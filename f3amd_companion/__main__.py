@@ -802,12 +802,52 @@ def cards() -> int:
     return model_cards.main()
 
 
+def convert(
+    weights: Positional[Path], family: str, to: str, preset: str = "", statistics: Path | None = None,
+    autoencoder: Path | None = None, text_weights: Path | None = None, source: Path | None = None,
+    layout: str = "humanml3d", overwrite: bool = False, out: Path = Path("out"),
+) -> None:  # fmt: skip
+    """Write weights that a paper's authors released as a model of ours, with a card of where they came from.
+
+    Args:
+      weights: arrays of their checkpoint, a .safetensors file (docs/reproduce.md).
+      family: acmdm, acmdm-autoencoder, acmdm-control, acmdm-noisy-condition, motionlcm-vae, motionlcm-teacher,
+        motionlcm-student, evaluator, acmdm-evaluator or acmdm-clip-evaluator.
+      to: name of the file.
+      preset: ours that says what the arrays do not, instead of the family's.
+      statistics: folder in which or below which their means and deviations lie (.npy).
+      autoencoder: arrays of ACMDM's autoencoder, for a model of its latent.
+      text_weights: folder of what embeds captions: CLIP, Sentence-T5, an evaluator's GloVe files.
+      source: folder in HumanML3D's layout, whose words have the tags that an evaluator reads.
+      layout: of the skeleton: humanml3d or kit.
+      overwrite: replace what lies there.
+      out: folder to write to.
+    """
+    target = out / f"{to}.safetensors"
+    terminal.check_there(weights, statistics, autoencoder, text_weights, source)
+    terminal.check_free([target, target.with_suffix(".md")], overwrite)
+    import jax.numpy as jnp
+
+    from f3amd_companion.ledger.model_cards import released_card
+    from f3amd_lib.ground.files import write_whole
+    from f3amd_lib.text import released
+    from f3amd_lib.text.stages.text_models import save_text_model
+
+    if family == "camdm":
+        raise ValueError("CAMDM's weights walk as they are: f3amd measure quality --published")
+    options = {"preset": preset, "statistics": statistics, "autoencoder": autoencoder, "layout": layout}
+    encoder = released.released_encoder(family, text_weights, source)
+    trained = _say_model(released.read_released(weights, family, encoder=encoder, **options))
+    save_text_model(target, trained, jnp.float32)
+    _say_written(target, write_whole(target.with_suffix(".md"), released_card(trained)))
+
+
 RESUMED = ("train", "crowd", "bench", "measure", "campaign", "sweep", "figures")
 """Commands that leave whole what they have done, and go on from it."""
 
 COMMANDS = (
     data, joints, dataset, styles, presets, train, rollout, text, crowd, export, steer, bench, measure, campaign, sweep,
-    figures, course, claims, cards,
+    figures, course, claims, cards, convert,
 )  # fmt: skip
 
 

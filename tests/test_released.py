@@ -10,13 +10,16 @@ from builders import refused
 from safetensors.numpy import save_file
 from scipy.special import erf, expit
 
+from f3amd_companion.__main__ import main
 from f3amd_lib.networks.presets import blank_network, count_parameters
+from f3amd_lib.text.data import text_encoders
 from f3amd_lib.text.data.humanml3d import tagged_captions
 from f3amd_lib.text.data.redundant import canonical_start, redundant_from_positions
-from f3amd_lib.text.data.text_encoders import TextEmbeddings, embed_captions, load_glove
+from f3amd_lib.text.data.text_encoders import TextEmbeddings, TextEncoder, embed_captions, load_glove
 from f3amd_lib.text.data.text_motions import going_on
 from f3amd_lib.text.networks import acmdm
 from f3amd_lib.text.released import FAMILIES, read_released, released_parts
+from f3amd_lib.text.sampling.captioned_motion import told_captions
 from f3amd_lib.text.stages.text_models import load_text_model, save_text_model
 from f3amd_lib.training.checkpoints import network_with
 
@@ -186,7 +189,7 @@ MILLIONS = {
 def test_released_shapes_are_those_of_our_networks_at_full_size(which):
     shapes, millions = MILLIONS[which]
     arrays = {name: np.broadcast_to(np.float32(0), shape) for name, shape in shapes.items()}
-    configs, made = released_parts(arrays, which.split()[0])
+    _, configs, made = released_parts(arrays, which.split()[0])
     for part, config in configs.items():
         sizes = [array.size for name, array in made.items() if name.startswith(f"{part}.")]
         assert sum(sizes) == count_parameters(config)
@@ -528,3 +531,23 @@ def test_a_judge_looks_at_as_many_numbers_of_a_frame_as_it_was_trained_on(folder
     vectors = redundant_from_positions(judge.skeleton, seen)
     assert judge.config.features == width
     close(judge.embed_motions([positions]), judge.embed_vectors([vectors]))
+
+
+# ------------------------------------------------------------------------------------------ the command
+
+
+def test_released_weights_become_a_file_of_ours_with_a_card(folder, tmp_path, monkeypatch, capsys):
+    embed = lambda captions: ([np.ones((1, 6))] * len(captions), np.ones((len(captions), 6)))
+    encoder = TextEncoder("t5-012345", 6, embed)
+    monkeypatch.setattr(text_encoders, "load_text_encoder", lambda kind, weights: {"t5": encoder}[kind])
+    words = ["convert", str(folder / "motionlcm-teacher.safetensors"), "--family", "motionlcm-teacher"]
+    words += ["--to", "teacher", "--statistics", str(folder), "--out", str(tmp_path)]
+    assert main(words) == 2 and "--text-weights" in capsys.readouterr().err
+    assert main([*words, "--text-weights", str(tmp_path)]) == 0
+    model = load_text_model(tmp_path / "teacher.safetensors")
+    assert (model.text_encoder, model.empty.tolist()) == ("t5-012345", [1.0] * 6)
+    card = (tmp_path / "teacher.md").read_text(encoding="utf-8")
+    assert all(FAMILIES["motionlcm-teacher"][what] in card for what in ("source", "licence"))
+    assert main([*words, "--text-weights", str(tmp_path)]) == 2 and "--overwrite" in capsys.readouterr().err
+    # What nobody knows the words of takes any; and its own encoder alone.
+    assert told_captions(model, encoder, ["somersault"]).shape == (1, 6)

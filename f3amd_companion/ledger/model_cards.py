@@ -31,7 +31,7 @@ from f3amd_lib.measures.registry import METRICS, SHOWN
 from f3amd_lib.networks.presets import find_preset
 from f3amd_lib.papers.printed import SCHEMAS
 from f3amd_lib.text.judge.text_judge import load_judge
-from f3amd_lib.text.stages.text_models import JUDGE, is_latent_preset, load_text_model
+from f3amd_lib.text.stages.text_models import JUDGE, CaptionedModel, is_latent_preset, load_text_model
 from f3amd_lib.training.checkpoints import load_model
 from f3amd_lib.training.pipeline import PRETRAINED_DIR
 
@@ -192,6 +192,15 @@ def judge_card(path: Path, seen: tuple[pd.DataFrame, dict] | None) -> str:
     if seen is not None and seen[1]["judge_weights"] == digest:
         wide, fields = _wide(seen[0], "system", _OF_JUDGE), {"repeats": seen[1]["settings"]["repeats"]}
     return _filled("judge_card", path, judge, judge.params, wide, digest=digest, **fields)
+
+
+def released_card(trained: CaptionedModel) -> str:
+    """Write the card of a model that `text.released` read."""
+    params = [part for part in (trained.params, *trained.parts()[0].values()) if part is not None]
+    return Path(__file__).with_name("released_card.template").read_text(encoding="utf-8").format(
+        trained=trained, record=trained.record, kind=trained.kind, weights_type="float32",
+        count=sum(leaf.size for leaf in jax.tree.leaves(params)), encoder=trained.text_encoder or "reads no captions",
+    )  # fmt: skip
 
 
 def committed_quality(dataset: str) -> pd.DataFrame | None:

@@ -7,6 +7,7 @@ shows how PyTorch itself, told to read weights only, writes the arrays into a sa
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import math
 import re
 import types
@@ -29,7 +30,8 @@ from f3amd_lib.motion.rotations import matrix_from_rotation_6d, rotation_6d_from
 from f3amd_lib.networks import presets
 from f3amd_lib.networks.config import CheckedConfig
 from f3amd_lib.papers.printed import PUBLISHED_CAMDM
-from f3amd_lib.text.data.humanml3d import LAYOUTS, layout_skeleton
+from f3amd_lib.text.data import text_encoders
+from f3amd_lib.text.data.humanml3d import LAYOUTS, layout_skeleton, tagged_captions
 from f3amd_lib.text.data.text_encoders import TextEncoder
 from f3amd_lib.text.data.text_motions import AxisNormaliser
 from f3amd_lib.text.judge.text_judge import TextJudge
@@ -204,7 +206,10 @@ def _statistics(folder, names: tuple[str, str], width: int) -> AxisNormaliser:
         if len(paths) != 1:
             several = f"has {len(paths)} files {name}" if folder else f"{name} is needed"
             raise ValueError(f"{folder or 'statistics'}: {several}; name the one folder of the release that has it")
-        numbers = np.load(paths[0], allow_pickle=False).astype(np.float32).ravel()[:width]
+        try:
+            numbers = np.load(paths[0], allow_pickle=False).astype(np.float32).ravel()[:width]
+        except (OSError, ValueError, EOFError):
+            numbers = np.empty(0)
         if len(numbers) < width or not np.isfinite(numbers).all():
             raise ValueError(f"{paths[0]}: must have {width} finite numbers, has {numbers.size}; fetch it again")
         found.append(numbers)
@@ -212,10 +217,10 @@ def _statistics(folder, names: tuple[str, str], width: int) -> AxisNormaliser:
 
 
 def released_parts(arrays: Mapping[str, np.ndarray], family: str, preset: str = "", *, layout="humanml3d", where=""):
-    """Return (config of each network by part, arrays by our names) of a release; arguments, errors: `read_released`."""
+    """Return (preset, config of each network by part, arrays by our names) of a release, as `read_released` says."""
     told = FAMILIES[family]
     base = preset.partition(CONTROL)[0] or told.get("preset")
-    found = base and presets.find_preset(base)
+    found = presets.find_preset(base) if base else None
     sizes = {size: found.network.get(field, usual) for size, (field, usual) in told.get("known", {}).items()}
     made, joints, settings = taken_arrays(arrays, family, sizes, where), layout_skeleton(layout).num_joints, {}
     if "P" in sizes:
@@ -232,7 +237,30 @@ def released_parts(arrays: Mapping[str, np.ndarray], family: str, preset: str = 
         usual = {"family": own.family, **own.network} if own else {"family": told["network"]}
         configs[part] = presets.config_from_dict({**usual, **told.get("settings", {}), **settings})
         settings = {}
-    return configs, made
+    return found, configs, made
+
+
+def released_encoder(family: str, folder=None, source=None) -> TextEncoder | None:
+    """Return what embeds captions as a family's models read them, None where they read none.
+
+    Args:
+      family: of `FAMILIES`.
+      folder: of its weights: CLIP ViT-B/32, Sentence-T5, GloVe files of the evaluators, CLIP's tokeniser.
+      source: of GloVe: the data set's folder, whose words have tags.
+
+    Raises:
+      ValueError: for a folder that is needed and not given, or as the encoders' loaders.
+    """
+    check_known(family, FAMILIES, "family of released weights")
+    kind = FAMILIES[family].get("encoder")
+    if kind is None:
+        return None
+    if folder is None or (kind == "glove" and source is None):
+        needed = "--text-weights and --source" if kind == "glove" else "--text-weights"
+        raise ValueError(f"{family} reads captions of {kind}: name the folder ({needed})")
+    if kind == "glove":
+        return text_encoders.load_glove(folder, tagged_captions(source))
+    return text_encoders.load_clip_pieces(folder) if kind == "pieces" else text_encoders.load_text_encoder(kind, folder)
 
 
 def read_released(
@@ -261,8 +289,7 @@ def read_released(
     check_known(family, FAMILIES, "family of released weights")
     check_known(layout, LAYOUTS, "layout")
     told, branch = FAMILIES[family], preset.partition(CONTROL)[1:]
-    found = presets.find_preset(base) if (base := preset.partition(CONTROL)[0] or told.get("preset")) else None
-    configs, made = released_parts(released_arrays(path), family, preset, layout=layout, where=path)
+    found, configs, made = released_parts(released_arrays(path), family, preset, layout=layout, where=path)
     config, coder = configs.get("params"), configs.get("autoencoder")
     params = {part: _params(presets.blank_network(one)[1], made, part, path) for part, one in configs.items()}
     about = {"config": config, "params": params.get("params"), "record": _record(told, family, path, layout, found)}
@@ -309,8 +336,9 @@ def _record(told: dict, family: str, path, layout: str, preset: presets.Preset |
     training = {field.name: field.default for field in dataclasses.fields(LatentMotionTraining)[1:]}
     training |= preset.training if preset and preset.paper == "motionpcm" else {}
     return run_record(
-        profile="released", dataset=data, seed=0, family=family, identity={"training": training}, file=Path(path).name
-    )
+        profile="released", dataset=data, seed=0, family=family, identity={"training": training}, file=Path(path).name,
+        sha256=hashlib.sha256(Path(path).read_bytes()).hexdigest(),
+    )  # fmt: skip
 
 
 def _camdm(path, packed: PackedMotion, config, params, record) -> TrainedModel:
