@@ -19,7 +19,7 @@ from f3amd_lib.text.data.text_encoders import TextEmbeddings, TextEncoder, embed
 from f3amd_lib.text.data.text_motions import going_on
 from f3amd_lib.text.networks import acmdm
 from f3amd_lib.text.released import FAMILIES, read_released, released_parts
-from f3amd_lib.text.sampling.captioned_motion import told_captions
+from f3amd_lib.text.sampling import captioned_motion
 from f3amd_lib.text.stages.text_models import load_text_model, save_text_model
 from f3amd_lib.training.checkpoints import network_with
 
@@ -550,4 +550,15 @@ def test_released_weights_become_a_file_of_ours_with_a_card(folder, tmp_path, mo
     assert all(FAMILIES["motionlcm-teacher"][what] in card for what in ("source", "licence"))
     assert main([*words, "--text-weights", str(tmp_path)]) == 2 and "--overwrite" in capsys.readouterr().err
     # What nobody knows the words of takes any; and its own encoder alone.
-    assert told_captions(model, encoder, ["somersault"]).shape == (1, 6)
+    assert captioned_motion.told_captions(model, encoder, ["somersault"]).shape == (1, 6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("family", ["acmdm-control", "acmdm-noisy-condition", "motionlcm-teacher", "motionlcm-student"])
+def test_a_released_model_makes_motion_at_once(family, folder):
+    model, how = read(folder, family), {} if family == "motionlcm-student" else {"num_steps": 2}
+    if family == "acmdm-control":
+        wrist = captioned_motion.find_joint(model, "left_wrist")
+        how["control"] = captioned_motion.control_of(model, wrist, np.array([0, 20]), np.ones((2, 3)), 40)
+    made = captioned_motion.draw_motions(model, np.ones((1, 6), np.float32), 40, jax.random.key(0), **how)
+    assert made.shape == (1, 40, 22, 3) and np.isfinite(made).all() and np.ptp(made) > 0
