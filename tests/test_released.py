@@ -131,7 +131,6 @@ def clip_shapes(d=512, f=1024, features=67, depth=8, words=49408, out=512):
 
 SMALL = {
     "acmdm-autoencoder": autoencoder_shapes(4),
-    "acmdm-vae": autoencoder_shapes(4, 8),
     "acmdm": acmdm_shapes(2, head=4, text=6),
     "acmdm-control": acmdm_shapes(2, head=4, text=6, control=True),
     "acmdm-noisy-condition": acmdm_shapes(2, 2, head=4, text=6, noisy=True),
@@ -229,12 +228,13 @@ def test_pickles_unknown_families_and_what_is_not_given_are_refused(folder, tmp_
     refused("acmdm-controll.*acmdm-control", read_released, folder / "a.safetensors", "acmdm-controll")
     refused("22x3_mean.npy is needed", read, folder, "acmdm-autoencoder", statistics=None)
     refused("has 0 files 22x3_mean.npy", read, folder, "acmdm-autoencoder", statistics=tmp_path)
+    refused("F3AMD-FNO-96 is no ACMDM", read, folder, "acmdm", preset="F3AMD-FNO-96")
     refused("name the arrays of that autoencoder", read, folder, "acmdm", autoencoder=None)
     np.save(tmp_path / "22x3_mean.npy", np.ones(2))
     refused("must have 3 finite numbers", read, folder, "acmdm-autoencoder", statistics=tmp_path)
 
 
-@pytest.mark.parametrize("family", ["acmdm-control", "motionlcm-student", "acmdm-vae"])
+@pytest.mark.parametrize("family", ["acmdm-control", "motionlcm-student", "acmdm-autoencoder"])
 def test_a_released_model_is_kept_as_a_file_of_ours(family, folder, tmp_path):
     model = read(folder, family)
     save_text_model(tmp_path / "model.safetensors", model, jnp.float32)
@@ -405,9 +405,13 @@ def test_acmdm_computes_what_the_released_network_does(family, folder):
     close(found[0], wanted)
 
 
-@pytest.mark.parametrize("family", ["acmdm-autoencoder", "acmdm-vae"])
-def test_the_autoencoder_computes_what_the_released_one_does(family, folder):
-    codec, torch = read(folder, family).codec, Torch(random_arrays(SMALL[family]))
+@pytest.mark.parametrize(("preset", "encoded"), [("ACMDM-causal-AE", 4), ("ACMDM-causal-VAE", 8)])
+def test_the_autoencoder_computes_what_the_released_one_does(preset, encoded, folder, tmp_path):
+    arrays = random_arrays(autoencoder_shapes(4, encoded))
+    save_file(arrays, tmp_path / "ae.safetensors")
+    model = read_released(tmp_path / "ae.safetensors", "acmdm-autoencoder", preset=preset, statistics=folder)
+    codec, torch = model.codec, Torch(arrays)
+    assert model.name == preset
     rng = np.random.default_rng(3)
     positions, latent = rng.normal(size=(8, 5, 3)), rng.normal(size=(2, 5, 4))
 

@@ -221,6 +221,8 @@ def released_parts(arrays: Mapping[str, np.ndarray], family: str, preset: str = 
     told = FAMILIES[family]
     base = preset.partition(CONTROL)[0] or told.get("preset")
     found = presets.find_preset(base) if base else None
+    if found and found.family != (usual := presets.find_preset(told["preset"]).family):
+        raise ValueError(f"{base} is no {usual}, as {family} is; name another preset")
     sizes = {size: found.network.get(field, usual) for size, (field, usual) in told.get("known", {}).items()}
     made, joints, settings = taken_arrays(arrays, family, sizes, where), layout_skeleton(layout).num_joints, {}
     if "P" in sizes:
@@ -309,10 +311,10 @@ def read_released(
         )  # fmt: skip
     codec = MotionCodec(normaliser("axes", 3), coder, params.get("autoencoder"))
     if config and found.latent:
-        coders = {one.get("preset"): name for name, one in FAMILIES.items() if "params" not in one["sizes"]}
         if autoencoder is None:
             raise ValueError(f"{path}: makes the latent of {found.latent}: name the arrays of that autoencoder, too")
-        codec = read_released(autoencoder, coders[found.latent], statistics=statistics, layout=layout).codec
+        options = {"preset": found.latent, "statistics": statistics, "layout": layout}
+        codec = read_released(autoencoder, "acmdm-autoencoder", **options).codec
         codec = dataclasses.replace(codec, latent=normaliser("latent", config.channels))
     if "c_x_embedder.*" in told["arrays"]:
         about["name"] += "".join(branch) or CONTROL
