@@ -134,7 +134,7 @@ def _places(root: Path, course: bool) -> pd.DataFrame:
                 note("tests", f"{path.stem}: {name}", mentioned_equations(text) | equations_in_name(name))
     folders = [root / "notebooks", root / "notebooks/course"][: 1 + course]
     for path in (path for folder in folders for path in sorted(folder.glob("[0-9][0-9]_*.ipynb"))):
-        # The reading guide shows this very map and explains none of it; solutions only repeat.
+        # The path has the paper's own section numbers, and the reading guide this very map; solutions only repeat.
         if path.stem.startswith("00") or path.stem.endswith("_solutions"):
             continue
         markdown = ("".join(cell["source"]) for cell in _cells(path) if cell["cell_type"] == "markdown")
