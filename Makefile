@@ -126,8 +126,8 @@ lint: $(INSTALLED) ## Check .py and .ipynb files with ruff, and that each import
 	$(PYTHON) -m ruff check .
 	@$(PYTHON) -m deptry . 2>/dev/null || $(PYTHON) -m deptry .
 
-lab: $(INSTALLED) ## Open the notebooks in JupyterLab
-	$(PYTHON) -m jupyterlab --notebook-dir=notebooks $(LAB_OPTIONS)
+lab: $(INSTALLED) ## Open the notebook beside the paper in JupyterLab
+	$(PYTHON) -m jupyterlab --notebook-dir=notebooks --LabApp.default_url=/lab/tree/00_beside_the_paper.ipynb $(LAB_OPTIONS)
 
 clean: ## Remove caches and build leftovers; keeps .venv, data/, runs/, paper_figures/
 	rm -rf build dist docs/_build .pytest_cache .ruff_cache .coverage* ./*.egg-info
