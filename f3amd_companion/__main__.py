@@ -25,7 +25,7 @@ from tyro.conf import Positional, UseAppendAction
 
 from f3amd_companion import terminal
 from f3amd_lib import __version__
-from f3amd_lib.ground.files import locked
+from f3amd_lib.ground.files import locked, write_whole
 from f3amd_lib.ground.names import check_known, checked_seed, checked_value
 from f3amd_lib.ground.profiles import find_model, load_profile, results_dir, runs_dir
 
@@ -54,6 +54,7 @@ with epy.lazy_imports():
     from f3amd_lib.networks import presets as network_presets
     from f3amd_lib.rollout import generated, start_poses
     from f3amd_lib.rollout import rollout as rollouts
+    from f3amd_lib.text import released
     from f3amd_lib.text.data import captioned_folder, text_encoders
     from f3amd_lib.text.judge import text_judge
     from f3amd_lib.text.sampling import captioned_motion
@@ -826,20 +827,13 @@ def convert(
     target = out / f"{to}.safetensors"
     terminal.check_there(weights, statistics, autoencoder, text_weights, source)
     terminal.check_free([target, target.with_suffix(".md")], overwrite)
-    import jax.numpy as jnp
-
-    from f3amd_companion.ledger.model_cards import released_card
-    from f3amd_lib.ground.files import write_whole
-    from f3amd_lib.text import released
-    from f3amd_lib.text.stages.text_models import save_text_model
-
     if family == "camdm":
         raise ValueError("CAMDM's weights walk as they are: f3amd measure quality --published")
     options = {"preset": preset, "statistics": statistics, "autoencoder": autoencoder, "layout": layout}
     encoder = released.released_encoder(family, text_weights, source)
     trained = _say_model(released.read_released(weights, family, encoder=encoder, **options))
-    save_text_model(target, trained, jnp.float32)
-    _say_written(target, write_whole(target.with_suffix(".md"), released_card(trained)))
+    text_models.save_text_model(target, trained, np.dtype("float32"))
+    _say_written(target, write_whole(target.with_suffix(".md"), model_cards.released_card(trained)))
 
 
 RESUMED = ("train", "crowd", "bench", "measure", "campaign", "sweep", "figures")
