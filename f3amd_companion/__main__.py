@@ -30,6 +30,7 @@ from f3amd_lib.ground.names import check_known, checked_seed, checked_value
 from f3amd_lib.ground.profiles import find_model, load_profile, results_dir, runs_dir
 
 with epy.lazy_imports():
+    import numpy as np
     import pandas as pd
     import safetensors
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from f3amd_lib.drawing.diagrams import arrow, boxes
 from f3amd_lib.drawing.style import PALETTE
+
+from f3amd_notebooks.drawings import arrow, boxes
 
 
 def label_windows(axis, millions) -> None:
