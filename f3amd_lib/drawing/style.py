@@ -99,7 +99,7 @@ def new_figure(width: float = 7.0, height: float = 3.6, nrows: int = 1, ncols: i
 
 
 def save_figure(figure: Figure, path) -> Path:
-    """Write a figure as PNG whose bytes depend on the drawing alone.
+    """Write a figure as PNG of at most 256 colours, whose bytes depend on the drawing alone.
 
     No date and no software version is written, so that an unchanged figure is an unchanged file.
     A figure drawn before is replaced.
@@ -115,7 +115,7 @@ def save_figure(figure: Figure, path) -> Path:
       ValueError: if the name does not end in .png.
     """
     path = named_file(path, ".png", "figures")
-    return write_whole(path, _png(figure, None))
+    return write_whole(path, _few_colors(_png(figure, None), 256))
 
 
 def show_figure(figure: Figure, *, dpi: int = 100, colors: int | None = None, full: str = ""):
@@ -131,10 +131,7 @@ def show_figure(figure: Figure, *, dpi: int = 100, colors: int | None = None, fu
 
     if colors is None:
         return Shown(data=_png(figure, dpi))
-    whole, small = Image.open(io.BytesIO(_png(figure, dpi))).convert("RGB"), io.BytesIO()
-    few = whole.quantize(colors, Image.Quantize.MAXCOVERAGE, kmeans=1, dither=Image.Dither.NONE)
-    few.save(small, "png", optimize=True)
-    return Shown(data=small.getvalue(), metadata={"full": full} if full else None)
+    return Shown(data=_few_colors(_png(figure, dpi), colors), metadata={"full": full} if full else None)
 
 
 def keep_figure(figure: Figure, results, name: str, colors: int = 64, data: str = ""):
@@ -155,6 +152,13 @@ def keep_figure(figure: Figure, results, name: str, colors: int = 64, data: str 
     file = save_figure(figure, Path(results) / "figures" / f"{name}.png")
     figure.set_layout_engine("none")  # everything stays where it was just laid out
     return show_figure(figure, dpi=76, colors=colors, full=hashlib.sha256(file.read_bytes()).hexdigest())
+
+
+def _few_colors(png: bytes, colors: int) -> bytes:
+    whole, small = Image.open(io.BytesIO(png)), io.BytesIO()
+    few = whole.convert("RGB").quantize(colors, Image.Quantize.MAXCOVERAGE, kmeans=1, dither=Image.Dither.NONE)
+    few.save(small, "png", optimize=True, dpi=whole.info["dpi"])
+    return small.getvalue()
 
 
 def _png(figure: Figure, dpi: int | None) -> bytes:
