@@ -79,6 +79,14 @@ def test_position_code_by_hand():
     assert conditioning.position_code is position_code
 
 
+def test_no_two_frames_of_a_long_window_have_one_code():
+    code = position_code(-10, 64, 8)
+    np.testing.assert_array_equal(code[:42], position_code(-10, 32, 8))
+    np.testing.assert_allclose(code[10 + 63, :2], [np.sin(63), np.cos(63)], atol=1e-12)
+    apart = np.linalg.norm(code[:, None] - code[None], axis=-1)
+    assert apart[~np.eye(len(code), dtype=bool)].min() > 0.01
+
+
 @pytest.mark.parametrize("rate", [0.2, 0.5])
 def test_dropout_keeps_the_mean(rate):
     x = 1.0 + np.abs(draw(400, 500))

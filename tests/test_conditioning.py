@@ -120,6 +120,18 @@ def test_without_a_position_code_c_is_the_same_in_every_frame(monkeypatch):
     np.testing.assert_allclose(c, jnp.broadcast_to(c[:, :1], c.shape), atol=1e-6)
 
 
+def test_a_path_row_counts_at_its_own_frame_of_a_window_of_64():
+    """The paper's row of frame t moved to t + 32, with as many others between, is another question."""
+    sizes = {"channels": CHANNELS, "num_styles": STYLES, "window": 64, "num_history": HISTORY}
+    encoder = ConditionEncoder(ConditionedConfig(**sizes, latent_width=WIDTH), 1, rngs=nnx.Rngs(params=0))
+    moved = {}
+    for frame in (5, 37):
+        path = np.zeros((1, 64, 8), np.float32)
+        path[:, frame] = 3.0
+        moved[frame] = encoder(encoder.encode(make_condition(1)._replace(path=path)), 1.0)
+    assert np.abs(moved[5] - moved[37]).max() > 1e-3
+
+
 def test_eq05_to_eq07_equal_plain_numpy():
     film = randomise(FiLM(WIDTH, 5, rngs=nnx.Rngs(params=0)))
     z, c = draw(2, WINDOW, WIDTH), draw(2, WINDOW, 5, seed=1)

@@ -391,3 +391,11 @@ def test_a_rollout_is_settled_character_by_character_from_its_own_history():
     assert locked.feet_locked and not np.array_equal(locked.frames, made.frames)
     swapped = dataclasses.replace(made, history=made.history[::-1])
     assert not np.array_equal(lock_rollout_online(swapped).frames, locked.frames)
+
+
+def test_lengths_are_metres_beside_a_leg(walk):
+    leg = walk.positions[0, leg_chains(walk.skeleton)[0]]
+    length = np.linalg.norm(np.diff(leg[:3], axis=0), axis=-1).sum()
+    lengths = foot_locking.FARTHEST, foot_locking.DEEPEST, feet_oracle.SLACK, foot_locking._STEP_HEIGHT
+    for metres, share in zip(lengths, (0.4, 0.08, 0.05, 0.05), strict=True):
+        assert 0.1 * share < metres / length < share

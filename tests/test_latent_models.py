@@ -151,7 +151,6 @@ def data(tmp_path, monkeypatch):
     return text_motions(clips, skeleton=motion.skeleton, name="bandai", fps=20.0, licence="ours", credit="nobody")
 
 
-@pytest.mark.slow
 def test_each_stage_sees_training_clips_alone_and_keeps_the_weights_that_are_used(data, tmp_path, monkeypatch):
     """A loop that trains nothing: weights of ones, whose moving average is twos."""
     tasks = {}

@@ -385,6 +385,35 @@ def test_the_critic_sees_the_students_end_carried_to_its_time_and_the_data_throu
     assert float(loss) == pytest.approx(float(terms["consistency"]) + 0.1 + 2.0)
 
 
+def test_each_player_follows_its_own_loss(batch, monkeypatch):
+    """With a number for each player's weights: the student's answer is that share of its state, a score a sum."""
+
+    class Player(Looking):
+        def __init__(self, share):
+            self.share = share
+
+        def __call__(self, state, *_):
+            return self.share * state
+
+        def features(self, state, *_):
+            return state
+
+    def made(config, share):
+        critic = isinstance(config, DiscriminatorConfig)
+        return (lambda seen: share * seen.sum(axis=(1, 2))) if critic else Player(share)
+
+    monkeypatch.setattr(motionpcm_training, "network_with", made)
+    terms = lambda params: usual_task().loss(params, None, batch, None)[1][0]
+    params = {"student": jnp.asarray(0.1), "discriminator": jnp.asarray(1e-3)}
+    slopes, before = jax.jacrev(terms)(params), terms(params)
+    assert slopes["discriminator"]["student"] == slopes["adversarial"]["discriminator"] == 0.0
+    assert slopes["adversarial"]["student"] != 0.0 != slopes["consistency"]["student"]
+    # No score is beyond a margin: the student's loss is 1 less the score of what it made, the heads' 2 more that less
+    # the data's.
+    data = 1e-3 * float(batch.real.sum(axis=(1, 2)).mean())
+    assert float(before["discriminator"]) == pytest.approx(3.0 - float(before["adversarial"]) - data, abs=1e-5)
+
+
 def test_the_critic_looks_from_end_to_end_of_phases_that_are_not_of_one_length(monkeypatch):
     monkeypatch.setattr(motionpcm_training, "network_with", lambda config, params: Looking())
     count = 20_000

@@ -4,14 +4,15 @@ import dataclasses
 import hashlib
 
 import numpy as np
-from builders import wandering_motion
+from builders import stiff_walk, wandering_motion
 from f3amd_notebooks.drawings import poses_beside
 from matplotlib.collections import LineCollection
+from matplotlib.colors import to_hex
 
-from f3amd_lib.drawing.pictures import crowd_figure
-from f3amd_lib.drawing.stick_figures import Camera, drawn_points
+from f3amd_lib.drawing.pictures import crowd_figure, film_strip
+from f3amd_lib.drawing.stick_figures import LIMB_COLORS, Camera, drawn_points
 from f3amd_lib.drawing.style import keep_figure, new_figure
-from f3amd_lib.motion.skeleton import Motion
+from f3amd_lib.motion.skeleton import Motion, turn
 
 # --- the camera --------------------------------------------------------------------------------
 
@@ -29,6 +30,18 @@ def test_perspective_by_hand():
 
 def bodies(axis) -> list[LineCollection]:
     return [item for item in axis.collections if isinstance(item, LineCollection) and item.get_zorder() == 5]
+
+
+def test_a_film_strip_shows_a_walk_from_its_own_front_right_wherever_it_goes():
+    """Ahead is to the right of the page, and the right leg lies over the left one."""
+    for yaw in (0.0, 2.0):
+        (body,) = bodies(film_strip(turn(stiff_walk(0.04), yaw), num_poses=1).axes[0])
+        colors = [to_hex(color).upper() for color in body.get_colors()]
+        left, right = (colors.index(LIMB_COLORS[side]) for side in ("left", "right"))
+        assert colors[::-1].index(LIMB_COLORS["right"]) < colors[::-1].index(LIMB_COLORS["left"])
+        for limb in (left, right):  # from a hip to the toes before it
+            ends = [line for line, color in zip(body.get_segments(), colors, strict=True) if color == colors[limb]]
+            assert max(end[1, 0] - end[0, 0] for end in ends) > 0.03
 
 
 # --- crowds ------------------------------------------------------------------------------------

@@ -18,6 +18,7 @@ from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.measures import protocol as module
 from f3amd_lib.measures.classifier import train_classifier
+from f3amd_lib.measures.distributions import diversity
 from f3amd_lib.measures.protocol import (
     REFERENCE_MODELS,
     Protocol,
@@ -31,13 +32,12 @@ from f3amd_lib.measures.protocol import (
 )
 from f3amd_lib.measures.real_clips import sideways_share
 from f3amd_lib.measures.registry import METRICS, SHOWN
+from f3amd_lib.motion.root_paths import named_path
 from f3amd_lib.motion.synthetic import synthesize
 from f3amd_lib.networks import presets
 from f3amd_lib.rollout.rollout import MotionGenerator
 from f3amd_lib.training.checkpoints import TrainedModel
 from f3amd_lib.training.pipeline import PreparedData
-
-pytestmark = pytest.mark.slow
 
 STYLES = ("ArmsOverhead", "Zombie")
 SIZES = {"window": 20, "widths": (8, 12), "hidden_width": 24, "feature_width": 16}
@@ -92,6 +92,7 @@ def one(rows: pd.DataFrame, metric: str, seed: int = 0) -> float:
     return value
 
 
+@pytest.mark.slow
 def test_a_models_rows_are_tidy(measured):
     rows, rounds = measured
     assert list(rows) == [*("model", "window_frames", "steps", "varies", "seed", "metric", "unit", "better", "value")]
@@ -107,7 +108,7 @@ def test_a_models_rows_are_tidy(measured):
     assert set(rounds["round"]) == {1, 2, 3}
 
 
-def test_everybody_is_measured_on_his_own_path_floor_and_style(packed, classifier, monkeypatch):
+def test_everybody_is_measured_on_his_own_path_floor_and_style(packed, monkeypatch):
     """Of two styles and two seeds, with stand-ins that write down what they are given."""
     walked, judged, told = {}, [], []
 
@@ -121,7 +122,8 @@ def test_everybody_is_measured_on_his_own_path_floor_and_style(packed, classifie
     monkeypatch.setattr(module, "_figures_without_classifier", lambda *given: judged.append(given) or {"IRD": 0.0})
     monkeypatch.setattr(module, "classify_windows", lambda classifier, motions, styles: told.append((motions, styles)))
     monkeypatch.setattr(module, "distribution_figures", lambda *given: {})
-    seeds = rollout_figures(walk_protocol(walker, packed, SMALL), packed, classifier, SMALL)
+    monkeypatch.setattr(module, "real_features", lambda *given: {})
+    seeds = rollout_figures(walk_protocol(walker, packed, SMALL), packed, None, SMALL)
     assert seeds == [{"IRD": 0.0}] * 2
     assert walked["styles"] == [*STYLES, *STYLES]
     assert [motion.number for motion, *_ in judged] == [0, 1, 2, 3]
@@ -134,17 +136,53 @@ def test_everybody_is_measured_on_his_own_path_floor_and_style(packed, classifie
     assert all(styles == list(STYLES) for _, styles in told)
 
 
-def test_real_windows_are_training_windows_and_real_rows_are_not(packed, classifier):
-    """FID compares with the training clips; the row `real` is made of both held-out splits."""
-    known = classifier.references["train"]
-    assert set(np.asarray(packed.clip_split)[known.clips]) == {0}
-    counted = sum(len(features) for features in module.real_features(packed, classifier, STYLES, 32).values())
-    assert 0 < counted <= len(known.features)
+def test_the_row_of_real_motion_is_made_of_both_held_out_splits(packed):
     clips, labels = module.held_out_clips(packed, STYLES, 32)
     assert set(np.asarray(packed.clip_split)[clips]) == {1, 2}
     assert [packed.styles[packed.clip_style[clip]] for clip in clips] == labels.tolist()
 
 
+def test_fid_compares_with_training_windows_of_the_styles_asked_for(packed):
+    """References of a classifier that saw one window of each clip, its features the clip's number."""
+    number = np.arange(packed.num_clips)
+    seen = types.SimpleNamespace(clips=number, features=number[:, None], styles=np.asarray(packed.clip_style))
+    judge = types.SimpleNamespace(references={"train": seen}, style_index=STYLES.index)
+    for styles in (STYLES, STYLES[1:]):
+        real = module.real_features(packed, judge, styles, 32)
+        assert list(real) == [STYLES.index(style) for style in styles]
+        for style, features in real.items():
+            assert features.size
+            assert {(packed.clip_style[clip], packed.clip_split[clip]) for clip in features[:, 0]} == {(style, 0)}
+
+
+class Walker:
+    """Walks its path in its style's gait; with `noise`, a joint that lies elsewhere in each sample."""
+
+    def __init__(self, noise):
+        self.noise = noise
+
+    def rollout(self, paths, styles, *, seed, history=None):
+        def motion(place):
+            positions = np.zeros((len(paths[place].position), 2, 3))
+            positions[..., [0, 2]] = paths[place].position[:, None]
+            positions[:, 1, 1] = STYLES.index(styles[place]) + self.noise * place
+            return types.SimpleNamespace(positions=positions)
+
+        return types.SimpleNamespace(history=np.zeros((len(paths), 10, 9)), motion=motion, styles=styles)
+
+
+def test_samples_of_one_start_share_their_path_and_style_and_differ_in_noise_alone():
+    paths = [named_path("complex", 40, seed=seed) for seed in range(2)]
+    samples = lambda noise: module._samples_of_one_start(Walker(noise), paths, list(STYLES), 3, (0, 1))
+    still = samples(0.0)
+    assert still.shape == (2, 3, 40, 2, 3) and diversity(still) == 0.0 < 1.0 < diversity(samples(0.1))
+    for style, (rows, path) in enumerate(zip(still, paths, strict=True)):
+        for row in rows:
+            np.testing.assert_array_equal(row[:, 0, [0, 2]], path.position)
+            assert (row[:, 1, 1] == style).all()
+
+
+@pytest.mark.slow
 def test_an_untrained_network_scores_worse_than_real_motion(measured, packed, classifier):
     rows, _ = measured
     real = measure_real(packed, classifier, SMALL, window=32)
@@ -156,6 +194,7 @@ def test_an_untrained_network_scores_worse_than_real_motion(measured, packed, cl
     assert set(real["varies"]) == {"clips"} and set(real["seed"]) == set(range(20))
 
 
+@pytest.mark.slow
 def test_bad_generators_are_told_apart(packed, classifier):
     tables = {model: measure_real(packed, classifier, SMALL, window=32, model=model) for model in REFERENCE_MODELS}
     real = tables["real"]
@@ -198,6 +237,7 @@ def test_seeds_become_means_with_intervals():
     assert np.isnan(single["low"][0]) and single["value"][0] == 1.0
 
 
+@pytest.mark.slow
 def test_a_clip_shorter_than_the_classifiers_window_is_left_out(classifier):
     long, short = synthesize(STYLES[0], 2.0, 0), synthesize(STYLES[1], 2.0, 0).slice(0, classifier.config.window - 1)
     seen = module.classify_windows(classifier, [short, long, short], [STYLES[1], STYLES[0], STYLES[1]])
@@ -207,6 +247,7 @@ def test_a_clip_shorter_than_the_classifiers_window_is_left_out(classifier):
     refused("no motion has the 20 frames", module.classify_windows, classifier, [short], STYLES[1:2])
 
 
+@pytest.mark.slow
 def test_too_few_windows_and_unknown_styles_are_refused(packed, classifier):
     many = dataclasses.replace(SMALL, windows_per_style=1000)
     refused("1000 windows of style", measure_real, packed, classifier, many, window=32)
@@ -220,6 +261,7 @@ def test_too_few_windows_and_unknown_styles_are_refused(packed, classifier):
     refused("'?Zombi'?", measure_real, packed, classifier, unknown, window=32)
 
 
+@pytest.mark.slow
 def test_classes_that_nobody_walks_do_not_count(generator, packed, prepared, classifier):
     alone = dataclasses.replace(SMALL, styles=STYLES[:1])
     real = module.real_features(packed, classifier, alone.styles, 32)
@@ -243,6 +285,7 @@ def name(classifier, generator, tmp_path, monkeypatch):
     return trained.name
 
 
+@pytest.mark.slow
 def test_the_measurement_keeps_its_rows_and_goes_on(name, prepared, monkeypatch):
     profile = load_profile("smoke", "synthetic", rollout_rounds=3)
     path = measure.measure_quality(prepared, profile)
@@ -259,6 +302,7 @@ def test_the_measurement_keeps_its_rows_and_goes_on(name, prepared, monkeypatch)
     pd.testing.assert_frame_equal(read_table(path)[0], table)
 
 
+@pytest.mark.slow
 def test_the_metrics_own_sensitivity_is_measured(name, prepared, tmp_path, monkeypatch):
     profile = load_profile("smoke", "synthetic", rollout_rounds=3, num_steps=1)
     graded, record = read_table(measure.measure_sensitivity(prepared, profile))

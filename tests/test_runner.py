@@ -1,12 +1,16 @@
 """Records that grow row by row: what is there is kept, what has changed is measured again."""
 
 import logging
+from types import SimpleNamespace
 
+import numpy as np
 import pandas as pd
 import pytest
 
+from f3amd_companion.measuring import measure
 from f3amd_companion.measuring.runner import Records
 from f3amd_lib.ground.records import read_table, run_record
+from f3amd_lib.ground.trees import weights_digest
 
 KEYS = ["model", "steps"]
 
@@ -88,3 +92,22 @@ def test_what_another_run_has_measured_alike_counts_and_stays_as_it_is(run, tmp_
     assert run([row("a", 8)], folder=tmp_path / "there", known=tmp_path)[0] == [("a", 8)]
     assert {path: path.read_bytes() for path in theirs} == theirs | {tmp_path / "figures.csv": b"half a ta"}
     assert not list(tmp_path.glob("*.old*"))
+
+
+def test_rows_and_records_name_the_weights_of_their_own_model(tmp_path, monkeypatch):
+    monkeypatch.setattr(measure, "_records_dir", lambda profile: tmp_path)
+    monkeypatch.setattr(
+        measure, "_record", lambda *_, **told: run_record(profile="smoke", dataset="synthetic", seed=0, **told)
+    )
+    trained = {name: SimpleNamespace(params={"w": np.full(3, number)}) for number, name in enumerate("AB")}
+    own = {name: weights_digest(model.params) for name, model in trained.items()}
+    assert own["A"] != own["B"]
+    todo, rows = [{"model": name, "steps": 8} for name in ("A", "B", "real")], pd.DataFrame({"value": [1.0]})
+    path = measure._measure(
+        None, measure._record(), ["walks"], todo, lambda _: {"walks": rows}, again=(), trained=trained, other="-"
+    )
+    table, record = read_table(path)
+    assert dict(zip(table["model"], table["weights"], strict=True)) == own | {"real": "-"}
+    assert record["weights_digests"] == {name: [digest] for name, digest in (own | {"real": "-"}).items()}
+    path = measure._write_anew(None, None, "whole", table, trained)
+    assert read_table(path)[1]["weights_digests"] == {name: [digest] for name, digest in own.items()}

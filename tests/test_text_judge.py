@@ -111,6 +111,19 @@ def test_clips_that_share_no_pair_are_all_judged_in_random_groups(data):
         text_judge.judged_clips(few)
 
 
+def test_texts_are_ranked_among_those_of_other_pairs_alone(data):
+    """Two captions of one pair tell the same: neither is wrong for the other's motion, and they are in no group."""
+    real = text_judge.judged_clips(data)
+    assert real.pairs == tuple(np.array(data.pairs)[data.members("test")]) and len(set(real.pairs)) == 4
+    embedded = np.random.default_rng(0).normal(size=(len(real.pairs), 8))
+    figures = lambda group: text_judge.text_figures(
+        embedded, embedded, embedded, real.pairs, np.random.default_rng(0), group
+    )
+    assert figures(4)["R_precision_1"] == 1.0
+    with pytest.raises(ValueError, match="groups of 5 need as many pairs of content and style, got 4"):
+        figures(5)
+
+
 def test_what_cannot_be_judged_is_refused(judge, data, cache_dir):
     real = text_judge.judged_clips(data)
     other = OneVectorAWord()

@@ -48,6 +48,10 @@ def test_groups_hold_no_pair_twice():
     assert not np.array_equal(groups, again)
     with pytest.raises(ValueError, match="groups of 32 need as many pairs of content and style, got 5"):
         text_metrics.groups_of_unlike_pairs(["a", "b", "c", "d", "e"] * 9, np.random.default_rng(0))
+    # Of a pair with several clips, any of them is taken.
+    several = np.repeat(["a", "b", "c"], 6)
+    taken = [set(text_metrics.groups_of_unlike_pairs(several[:14], np.random.default_rng(k), 3)[0]) for k in range(9)]
+    assert len(set.union(*taken)) > 9
 
 
 def test_matching_and_score():

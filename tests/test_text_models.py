@@ -23,8 +23,6 @@ from f3amd_lib.text.sampling import captioned_motion
 from f3amd_lib.text.stages import acmdm_training, text_models, train_stage
 from f3amd_lib.text.stages.text_models import controlled_joints, find_text_model, load_text_model, save_text_model
 
-pytestmark = pytest.mark.slow
-
 STYLES = synthetic.STYLES[:2]
 SIZES = {"latent_width": 16, "depth": 1, "num_heads": 2, "channels": 3, "window": 40}
 LATENT = {**SIZES, "channels": 4, "window": 8}
@@ -77,6 +75,7 @@ def load(folder, name):
 # --------------------------------------------------------------------------------------------------------------- files
 
 
+@pytest.mark.slow
 def test_a_name_trains_what_it_stands_on_and_files_are_whole(folder, data):
     base, controlled, prefix, codec = (
         load(folder, name) for name in ("tiny", "tiny+control", "tiny-prefix", "tiny-AE")
@@ -97,6 +96,7 @@ def test_a_name_trains_what_it_stands_on_and_files_are_whole(folder, data):
     )
 
 
+@pytest.mark.slow
 def test_a_branch_of_the_pelvis_learns_the_pelvis_alone(folder):
     every, pelvis = load(folder, "tiny+control"), load(folder, "tiny+control-pelvis")
     joints = lambda trained: trained.record["identity"]["model"]["joints"]["of"]
@@ -109,6 +109,7 @@ def test_a_branch_of_the_pelvis_learns_the_pelvis_alone(folder):
         captioned_motion.find_joint(pelvis, "left_wrist")
 
 
+@pytest.mark.slow
 def test_a_branch_stands_beside_the_network_that_ships_where_that_knows_the_motions(
     folder, data, tmp_path, monkeypatch
 ):
@@ -127,6 +128,7 @@ def test_a_branch_stands_beside_the_network_that_ships_where_that_knows_the_moti
     assert (tmp_path / "other" / "tiny.safetensors").exists()
 
 
+@pytest.mark.slow
 def test_models_come_back_from_their_files(folder, tmp_path):
     for name in ("tiny+control", "tiny-prefix", "tiny-redundant", "tiny-AE"):
         trained = load(folder, name)
@@ -147,6 +149,15 @@ def test_models_come_back_from_their_files(folder, tmp_path):
 # ------------------------------------------------------------------------------------------------------------- training
 
 
+def test_redundant_features_beside_positions_are_normalised_over_training_clips(data):
+    codec = train_stage._codec_of_positions(data, TINY["tiny-redundant"])
+    states = acmdm_training.encoded_clips(codec, data)
+    np.testing.assert_array_equal(states[..., :3], data.normaliser().normalise(data.positions))
+    part = np.repeat([split == "train" for split in data.splits], data.lengths)
+    np.testing.assert_allclose(states[part, :, 3:].mean(axis=(0, 1)), 0.0, atol=1e-4)
+    np.testing.assert_allclose(states[part, :, 3:].std(axis=(0, 1)), 1.0, atol=1e-3)
+
+
 def test_parts_see_training_clips_watch_others_and_ship_the_average(data, tmp_path, monkeypatch):
     """A loop that trains nothing: weights of ones, whose moving average is twos."""
     given = {}
@@ -158,9 +169,12 @@ def test_parts_see_training_clips_watch_others_and_ship_the_average(data, tmp_pa
         return types.SimpleNamespace(step=task.config.num_steps, params=params, averaged=average), []
 
     monkeypatch.setattr(train_stage, "train_in_legs", loop)
-    monkeypatch.setitem(presets.PRESETS, "tiny", TINY["tiny"])
+    for name in ("tiny", "tiny-AE"):
+        monkeypatch.setitem(presets.PRESETS, name, TINY[name])
+    codec = train_stage.train_stage(data, ENCODER, PROFILE, "tiny-AE", folder=tmp_path, **QUIET).codec
+    given.clear()
     made = train_stage.train_stage(data, ENCODER, PROFILE, "tiny+control", folder=tmp_path, **QUIET)
-    for weights in (made.params, made.branch, given["control branch"][0].base):
+    for weights in (made.params, made.branch, given["control branch"][0].base, codec.params):
         assert all((leaf == 2.0).all() for leaf in jax.tree.leaves(weights))
     axes, clips = data.normaliser(), {name: data.members(name) for name in ("train", "validation")}
     assert [len(of) for of in clips.values()] == [8, 2]
@@ -175,6 +189,7 @@ def test_parts_see_training_clips_watch_others_and_ship_the_average(data, tmp_pa
             assert any(np.allclose(motion, clip[s : s + len(motion)], atol=1e-5) for clip in known for s in starts)
 
 
+@pytest.mark.slow
 def test_a_window_shorter_than_the_clips_takes_their_first_frames(data, tmp_path, monkeypatch):
     """Clips begin at the origin; pieces from the middle would not."""
     given = {}
@@ -195,6 +210,7 @@ def test_a_window_shorter_than_the_clips_takes_their_first_frames(data, tmp_path
     assert given["record"]["dataset_fingerprint"] == cut.fingerprint != data.fingerprint
 
 
+@pytest.mark.slow
 def test_a_training_goes_on_where_it_was_killed_and_ends_as_one_that_was_not(folder, data, tmp_path):
     train = lambda **leg: train_stage.train_stage(data, ENCODER, PROFILE, "tiny", folder=tmp_path, **QUIET, **leg)
     assert train(stop_at=0.0) is None
@@ -202,6 +218,7 @@ def test_a_training_goes_on_where_it_was_killed_and_ends_as_one_that_was_not(fol
     assert same_tree(train().params, load(folder, "tiny").params)
 
 
+@pytest.mark.slow
 def test_a_finished_model_is_taken_as_it_is_and_one_of_other_settings_refused(folder, data):
     before = (folder / "tiny.safetensors").read_bytes()
     train = lambda profile: train_stage.train_stage(data, ENCODER, profile, "tiny", folder=folder, **QUIET)
@@ -211,6 +228,7 @@ def test_a_finished_model_is_taken_as_it_is_and_one_of_other_settings_refused(fo
     assert (folder / "tiny.safetensors").read_bytes() == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "message"),
     [
@@ -227,13 +245,11 @@ def test_what_cannot_be_trained_is_refused(folder, data, monkeypatch, name, mess
         train_stage.train_stage(data, ENCODER, PROFILE, name, folder=folder, **QUIET)
 
 
+@pytest.mark.slow
 def test_redundant_features_stand_beside_positions_and_are_not_motion(folder, data):
     plain, trained = load(folder, "tiny"), load(folder, "tiny-redundant")
     states = acmdm_training.encoded_clips(trained.codec, data)
     np.testing.assert_array_equal(states[..., :3], acmdm_training.encoded_clips(plain.codec, data))
-    part = np.repeat([split == "train" for split in data.splits], data.lengths)
-    np.testing.assert_allclose(states[part, :, 3:].mean(axis=(0, 1)), 0.0, atol=1e-4)
-    np.testing.assert_allclose(states[part, :, 3:].std(axis=(0, 1)), 1.0, atol=1e-3)
     # A step is that to the next frame's position.
     step = trained.codec.redundancy.restore(states[..., 3:])[..., :3]
     np.testing.assert_allclose(step[: data.start[1] - 1], np.diff(data.clip(0), axis=0), atol=1e-5)
@@ -245,6 +261,7 @@ def test_redundant_features_stand_beside_positions_and_are_not_motion(folder, da
     np.testing.assert_array_equal(trained.codec.decode(seen, np.ones((2, 4), bool)), seen[..., :3])
 
 
+@pytest.mark.slow
 def test_a_model_of_meshes_makes_vertices_and_the_joints_of_them(folder, data, tmp_path):
     trained = load(folder, "tiny-mesh")
     codec, mesh = trained.codec, trained.codec.mesh
@@ -273,6 +290,7 @@ def test_a_model_of_meshes_makes_vertices_and_the_joints_of_them(folder, data, t
         captioned_motion.draw_motions(load(folder, "tiny"), np.zeros((1, 8)), 24, jax.random.key(0), mesh=True)
 
 
+@pytest.mark.slow
 def test_models_are_found_by_name_or_the_newest(folder, monkeypatch):
     monkeypatch.setattr(text_models, "runs_dir", lambda *_: folder.parent)
     (folder.parent / "text").symlink_to(folder)
@@ -287,6 +305,7 @@ def test_models_are_found_by_name_or_the_newest(folder, monkeypatch):
 # ---------------------------------------------------------------------------------------------------------- told motion
 
 
+@pytest.mark.slow
 def test_the_model_is_told_the_caption_and_the_control_in_its_own_units(folder, monkeypatch):
     trained, seen = load(folder, "tiny+control"), {}
 
@@ -308,6 +327,7 @@ def test_the_model_is_told_the_caption_and_the_control_in_its_own_units(folder, 
     assert {"guidance": 2.0, "num_steps": 5, "sampler": "ddim"}.items() <= seen["told"].items()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["tiny-prefix", "raw"])
 def test_a_stream_goes_straight_on_wherever_it_walks(folder, name, monkeypatch):
     """An oracle in the network's place walks on by the step that it sees: so must the stream, in a straight line."""
@@ -352,6 +372,7 @@ def f3amd(folder, tmp_path, monkeypatch, capsys):
     return run
 
 
+@pytest.mark.slow
 def test_text_writes_three_files_that_say_the_same_and_overwrites_none(f3amd, tmp_path, data, caplog):
     caplog.set_level("INFO")
     assert f3amd("a person walks ArmsCrossed", "--seconds", "1.2", "--guidance", "1") == (0, "")
@@ -372,6 +393,7 @@ def test_text_writes_three_files_that_say_the_same_and_overwrites_none(f3amd, tm
     assert [file.read_bytes() for file in files] == before
 
 
+@pytest.mark.slow
 def test_text_takes_a_control(f3amd, tmp_path):
     path = tmp_path / "path.csv"
     path.write_text("frame,x,y,z\n0,0,1,0\n23,0,1,1\n")
@@ -379,6 +401,7 @@ def test_text_takes_a_control(f3amd, tmp_path):
     assert f3amd(*words, model="tiny+control") == (0, "")
 
 
+@pytest.mark.slow
 def test_text_streams_captions(f3amd, tmp_path):
     words = ("a person walks ArmsCrossed", "--then", "a person walks ArmsCrossed", "--seconds", "1")
     assert f3amd(*words, model="tiny-prefix") == (0, "")
@@ -389,6 +412,7 @@ def test_text_streams_captions(f3amd, tmp_path):
 CONTROL = ("a person walks", "--seconds", "1.2", "--control", "CSV")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "words, model, csv, wanted",
     [

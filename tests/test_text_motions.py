@@ -9,10 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from builders import packed_from, stiff_walk
 
 from f3amd_lib.data.packed import pack
 from f3amd_lib.data.sources import open_dataset
 from f3amd_lib.drawing.pictures import film_strip
+from f3amd_lib.motion.rotations import matrix_from_yaw
 from f3amd_lib.motion.skeleton import Motion, Skeleton, turn
 from f3amd_lib.text.data import text_motions
 from f3amd_lib.text.data.redundant import positions_from_redundant
@@ -185,6 +187,21 @@ def test_drawn_clips_are_whole_pieces_of_clips_with_their_own_captions():
     assert np.mean(length[clip == 1] == 36) == pytest.approx(1 / 3, abs=0.1)
     starts = np.round((motion[clip == 2, 0, 0, 0] - 2) / 0.01).astype(int)
     assert starts.min() == 0 and starts.max() >= 12  # anywhere that it fits
+
+
+@pytest.mark.parametrize("turned", [1.0, -1.0])  # named left; the second one turns right for all its name
+def test_a_twins_captions_and_pair_are_of_the_other_side(turned):
+    walk, yaw = stiff_walk(0.04), matrix_from_yaw(np.linspace(0.3, 0.3 + 2.0 * turned, 60))
+    rotations = np.concatenate([yaw[:, None], walk.rotations[:, 1:]], axis=1)
+    packed = packed_from([(walk.replace(rotations=rotations), 0, 0)], styles=("1-normal",))
+    packed = dataclasses.replace(packed, name="bandai", clip_contents=("walk-turn-left",))
+    made = text_motions.bandai_text_motions(packed)
+    sides = ("left", "right") if turned > 0 else ("right", "left")
+    for captions, pair, side, other in zip(made.captions, made.pairs, sides, sides[::-1], strict=True):
+        assert pair == f"walk-turn-{side}, normal"
+        assert any(side in told for told in captions) and not any(other in told for told in captions)
+    # What is shown turns there, too.
+    assert [np.sign(np.diff(np.unwrap(made.motion(clip).yaw)).mean()) for clip in range(2)] == [turned, -turned]
 
 
 # ----------------------------------------------------------------------------------------- Bandai

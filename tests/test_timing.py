@@ -13,7 +13,7 @@ from builders import refused
 
 from f3amd_companion.speed import machine
 from f3amd_companion.speed.machine import fast_xla_flags, matmul_precision, matmul_probe
-from f3amd_companion.speed.timing import take_turns
+from f3amd_companion.speed.timing import median_interval, take_turns
 
 
 class Clock:
@@ -43,6 +43,12 @@ def test_median_and_spread_leave_the_warm_up_out():
     assert timing.median == 51.0
     assert (timing.low, timing.high) == (6.0, 96.0)
     assert timing.rounds == 101
+
+
+def test_a_medians_interval_is_that_of_its_order_statistics():
+    """Of 1 to 9, a drawn median is at most 2 in 3 % of all draws, and at most 1 in none: P(binomial(9, 2 / 9) >= 5)."""
+    assert median_interval(range(1, 10)) == (2.0, 8.0) and median_interval(range(9, 0, -1)) == (2.0, 8.0)
+    assert median_interval([3.0] * 5) == (3.0, 3.0)
 
 
 def test_candidates_run_by_turns():

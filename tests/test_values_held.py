@@ -1,11 +1,18 @@
-"""Values that formulas cannot hold: printed numbers by their digests, recipes by the records of what ships."""
+"""Values that formulas cannot hold: printed numbers by their digests, others by records, papers' tables and a list."""
 
+import functools
 import hashlib
 from pathlib import Path
 
 import pytest
 
+from f3amd_companion.measuring import campaign
+from f3amd_companion.speed.measurements import plan
+from f3amd_lib.ground.files import read_toml
+from f3amd_lib.ground.papers import load_paper_table
 from f3amd_lib.ground.profiles import load_profile
+from f3amd_lib.ground.records import read_table
+from f3amd_lib.networks.presets import find_preset
 from f3amd_lib.training.checkpoints import load_model
 from f3amd_lib.training.pipeline import PRETRAINED_DIR
 from f3amd_lib.training.recipe import TrainingConfig, paper_recipe, profile_recipe
@@ -33,3 +40,73 @@ def test_what_ships_was_trained_as_presets_and_profiles_say_today(path):
     today = recipe.to_dict()
     differing = {name for name in today if recorded[name] != today[name]}
     assert differing == OTHERWISE.get(path.stem, LENGTH)
+
+
+ROOT = Path(__file__).resolve().parents[1]
+HELD = {
+    (file, place): value
+    for file, values in read_toml(Path(__file__).parent / "data" / "held_values.toml").items()
+    for place, value in values.items()
+}
+# Words alone, or what pages and bundles are made of, which tests of their own read.
+WORDS = {"claims", "commands", "readings", "schemas", "records", "colors", "claims_page", "onnx_card", "npm_packages"}
+ELSEWHERE = {"campaign", "targets", "steer"}
+_read = functools.cache(read_toml)
+
+
+def found(file, place):
+    """The value at a place such as "run/0/windows"."""
+    value = _read(ROOT / file)
+    for key in place.split("/"):
+        value = value[int(key) if isinstance(value, list) else key]
+    return value
+
+
+def test_values_are_those_that_were_meant():
+    assert {where: found(*where) for where in HELD} == HELD
+    assert all(type(found(*where)) is type(value) for where, value in HELD.items())
+    with pytest.raises((KeyError, IndexError)):
+        found("f3amd_lib/ground/profiles.toml", "common/none")
+
+
+def test_each_file_of_values_is_held_by_something():
+    files = {path for package in ("f3amd_lib", "f3amd_companion") for path in (ROOT / package).rglob("*.toml")}
+    listed = {ROOT / file for file, _ in HELD}
+    assert listed <= files
+    assert {path.stem for path in files - listed} == WORDS | ELSEWHERE
+
+
+# What the queue holds and no record has yet; what records have and no queue asks for (chosen by name, or cut short).
+UNMEASURED = {
+    "F3AMD-FNO-96-steady-seed0": {3200},
+    "F3AMD-FNO-96-seed0": {9600, 12800, 19400},
+    "CAMDM-batch-512-seed0": {6400},
+    "F3AMD-FNO-96-batch-512-seed0": {9600, 12800, 19400},
+    "F3AMD-FNO-96-residual-prior+higher-learning-rate+wide-decoder+history-input+batch-512-seed0": {6400},
+}
+BESIDE = 8
+
+
+def test_the_campaign_is_what_its_record_measured_and_what_waits():
+    table, _ = read_table(ROOT / "paper_figures/bandai/laptop/records/campaign.csv")
+    measured = set(zip(table["run"], table["windows"], strict=True))
+    asked = {(run.name, windows) for run, windows in campaign.queue()}
+    assert asked - measured == {(run, 1000 * windows) for run, all in UNMEASURED.items() for windows in all}
+    assert len(measured - asked) == BESIDE
+
+
+@pytest.mark.parametrize("number", [1, 4, 7])
+def test_the_suite_for_a_gpu_times_each_cell_of_the_papers_tables(number):
+    timed = {
+        ("PyTorch" in one.implementation, find_preset(one.model).name, one.window, one.steps, one.characters)
+        for group in plan("gpu").values()
+        for one in group
+        if one.precision == "tf32"
+    }
+    table = load_paper_table(number).query("device == 'GPU' and characters in (1, 32, 1024)")
+    table = table[(table["window_frames"] == 32) | (table["characters"] == 1024)]
+    assert len(table) >= 6
+    for row in table.itertuples():
+        torch = "PyTorch" in row.model
+        model = "CAMDM" if torch else find_preset(row.model).name
+        assert (torch, model, row.window_frames, row.steps, row.characters) in timed, row
