@@ -155,6 +155,29 @@ def test_fid_compares_with_training_windows_of_the_styles_asked_for(packed):
             assert {(packed.clip_style[clip], packed.clip_split[clip]) for clip in features[:, 0]} == {(style, 0)}
 
 
+def test_windows_go_by_the_motion_that_they_were_cut_from_and_scores_by_the_style_that_was_asked_for():
+    """A classifier that sees the number in a motion's joints; styles lie far apart, and each motion in its own."""
+    made = lambda number, frames: types.SimpleNamespace(
+        positions=np.full((frames, 1, 2), number + 0.0), num_frames=frames, skeleton=None
+    )
+    judge = types.SimpleNamespace(
+        config=types.SimpleNamespace(window=4),
+        windows_of=lambda positions, _: positions[: len(positions) // 4 * 4].reshape(-1, 8),
+        features_and_classes=lambda windows: (windows[:, :2], windows[:, 0].astype(int) % 2),
+        style_index=STYLES.index,
+    )
+    seen = module.classify_windows(judge, [made(k, 400 + 40 * k) for k in range(4)], [*STYLES, *STYLES])
+    np.testing.assert_array_equal(seen.features[:, 0], seen.source)
+    np.testing.assert_array_equal(seen.style, seen.source % 2)
+    spread = np.random.default_rng(0).normal(size=seen.features.shape)
+    seen = seen._replace(features=100.0 * seen.style[:, None] + spread)
+    real = {number: 100.0 * number + np.random.default_rng(1).normal(size=(200, 2)) for number in range(2)}
+    figures = module.distribution_figures(seen, real, 100, np.random.default_rng(2))
+    assert figures["style_accuracy"] == 100.0 and figures["FID"] < 10.0 and figures["CAMDM_FID"] < 1.0
+    # A style of one motion counts as much as one of three.
+    assert module._style_means([{"IRD": value} for value in (1.0, 1.0, 1.0, 5.0)], [*"aaab"]) == {"IRD": 3.0}
+
+
 class Walker:
     """Walks its path in its style's gait; with `noise`, a joint that lies elsewhere in each sample."""
 
