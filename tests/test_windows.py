@@ -28,11 +28,13 @@ from f3amd_lib.data.features import (
 from f3amd_lib.data.windows import (
     Batch,
     build_windows,
+    draw_windows,
     fit_normaliser,
     gather_windows,
     mean_poses,
     restart_from,
     sample_windows,
+    spread_windows,
     starting_poses,
 )
 from f3amd_lib.motion.rotations import matrix_from_yaw, wrap_angle
@@ -204,6 +206,27 @@ def test_half_of_the_samples_show_the_captured_path(sampled):
     captured = path_condition(sampled.future[..., [0, 2]], frame_yaw(SKELETON, sampled.future))
     same = np.abs(np.asarray(sampled.path - captured)).max(axis=(1, 2)) < 1e-4
     assert 0.4 < same.mean() < 0.6
+
+
+def test_what_is_drawn_of_a_window_is_drawn_by_itself(train):
+    index, yaw, smoothing = (np.asarray(drawn) for drawn in draw_windows(train, jax.random.key(3), 4000, 0.2))
+    assert [(smoothing == width).mean() for width in range(3)] == pytest.approx([0.2, 0.4, 0.4], abs=0.03)
+    assert np.abs(np.corrcoef([index, yaw, smoothing == 0])[np.triu_indices(3, 1)]).max() < 0.05
+
+
+def test_spread_windows_go_from_the_first_to_the_last(train):
+    every, few = all_windows(train), spread_windows(train, 3)
+    for place, index in enumerate((0, (train.num_windows - 1) // 2, train.num_windows - 1)):
+        for found, wanted in zip(few, every, strict=True):
+            np.testing.assert_array_equal(found[place], wanted[index])
+
+
+def test_styles_stand_where_the_model_knows_them(packed):
+    names = ("limping", *packed.styles[::-1])
+    known, own = (build_windows(packed, "train", window=WINDOW, num_history=HISTORY, styles=of) for of in (names, ()))
+    for windows, of in ((known, names), (own, packed.styles)):
+        assert windows.one_hot.shape == (len(packed.styles), len(of))
+        assert [of[int(place)] for place in windows.one_hot.argmax(axis=1)] == list(packed.styles)
 
 
 def test_normaliser_makes_training_features_standard(train):
