@@ -2,6 +2,8 @@
 
 import functools
 import hashlib
+import json
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -12,10 +14,13 @@ from f3amd_lib.ground.files import read_toml
 from f3amd_lib.ground.papers import load_paper_table
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import read_table
+from f3amd_lib.ground.trees import describe
 from f3amd_lib.networks.presets import find_preset
+from f3amd_lib.text.stages.acmdm_training import TextMotionTraining
+from f3amd_lib.text.stages.motionpcm_training import LatentMotionTraining
 from f3amd_lib.training.checkpoints import load_model
 from f3amd_lib.training.pipeline import PRETRAINED_DIR
-from f3amd_lib.training.recipe import TrainingConfig, paper_recipe, profile_recipe
+from f3amd_lib.training.recipe import TrainingConfig, paper_recipe, part_recipe, profile_recipe
 
 PRINTED = dict(line.split()[::-1] for line in (Path(__file__).parent / "data" / "printed_numbers.sha256").open())
 LENGTH = {"num_steps", "batch_size"}
@@ -40,6 +45,26 @@ def test_what_ships_was_trained_as_presets_and_profiles_say_today(path):
     today = recipe.to_dict()
     differing = {name for name in today if recorded[name] != today[name]}
     assert differing == OTHERWISE.get(path.stem, LENGTH)
+
+
+# Shipped model of text -> its settings and recipe; it differs in length, seed, and what its codec says.
+TEXT = {
+    "ACMDM-S-PS22-raw-n3": (TextMotionTraining, "short-denoiser"),
+    "MotionPCM-teacher-small": (LatentMotionTraining, "short-teacher"),
+    "MotionPCM-M1-small": (LatentMotionTraining, "short-student"),
+}
+
+
+@pytest.mark.parametrize("name", TEXT)
+def test_models_of_text_ship_as_presets_and_recipes_say_today(name):
+    shipped, (settings, recipe) = describe(PRETRAINED_DIR / f"bandai/text/{name}.safetensors"), TEXT[name]
+    recorded, today = shipped["record"]["identity"]["training"], asdict(part_recipe(settings, recipe, 1, name))
+    assert {key for key in today if recorded[key] != json.loads(json.dumps(today[key]))} - {
+        "num_steps",
+        "seed",
+    } == otherwise
+    network = find_preset(name).network
+    assert {key: shipped["model"].get(key) for key in network} == network
 
 
 ROOT = Path(__file__).resolve().parents[1]
