@@ -142,6 +142,14 @@ def test_noise_comes_from_the_seed_alone(network_generator):
     assert np.abs(first - other).max() > 1e-4
 
 
+def test_each_round_has_noise_of_its_own(trained):
+    """Of a network that answers with its noise, the rounds' heights."""
+    generator = MotionGenerator(trained, num_steps=1)
+    generator.sample_window = lambda key, condition: jax.random.normal(key, (1, WINDOW, CHANNELS))
+    height = generator.rollout(named_path("straight", 3 * WINDOW), "calm").frames[0, :, 1].reshape(3, WINDOW)
+    assert all(np.abs(height[one] - height[other]).max() > 0.01 for one, other in ((0, 1), (0, 2), (1, 2)))
+
+
 def test_frames_are_true_rotations_and_make_a_motion(network_generator):
     rollout = network_generator.rollout(named_path("circle", 20), "calm")
     first, second = np.split(split_frames(rollout.frames)[1], 2, axis=-1)
