@@ -171,3 +171,10 @@ def test_motion_that_a_recipe_cannot_break_is_refused():
         refused("strength must lie between 0 .* and 1", corrupt, name, whole, strength=np.nan)
     refused("a single frame cannot be shuffled", corrupt, "shuffled frames", whole.slice(0, 1))
     refused("unknown corruption 'frozen'; did you mean 'frozen pose'", corrupt, "frozen", whole)
+
+
+@pytest.mark.parametrize("name", ["shuffled frames", "noisy motion"])
+def test_the_seed_decides_what_is_random(name):
+    one, again, other = (corrupt(name, wandering_motion(30), seed=seed).root_position for seed in (1, 1, 2))
+    np.testing.assert_array_equal(one, again)
+    assert np.abs(one - other).max() > 0.01

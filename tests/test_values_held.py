@@ -3,15 +3,17 @@
 import functools
 import hashlib
 import json
+import re
 from dataclasses import asdict
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from f3amd_companion.measuring import campaign
 from f3amd_companion.speed.measurements import plan
 from f3amd_lib.ground.files import read_toml
-from f3amd_lib.ground.papers import load_paper_table
+from f3amd_lib.ground.papers import load_paper_file, load_paper_table, paper_folders
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.ground.trees import describe
@@ -97,6 +99,20 @@ def test_each_file_of_values_is_held_by_something():
     listed = {ROOT / file for file, _ in HELD}
     assert listed <= files
     assert {path.stem for path in files - listed} == WORDS | ELSEWHERE
+
+
+def test_factors_of_claims_are_those_that_their_words_state():
+    counted = 0
+    for paper in paper_folders():
+        for claim in load_paper_file("claims", paper)["claim"]:
+            for statement in claim["statement"]:
+                words = " ".join(str(of.get(key)) for of in (claim, statement) for key in ("says", "paper_says"))
+                said = {float(number.replace(",", "")) for number in re.findall(r"\d(?:[\d,]*\d)?(?:\.\d+)?", words)}
+                asked = [*statement.get("stated", ()), *statement.get("saving", ())]
+                about = np.ravel(statement.get("about", ())).tolist()
+                assert said >= {*asked} and (said >= {*about} or round(about[0] / about[1], 1) in said), claim["id"]
+                counted += len(asked + about)
+    assert counted > 30
 
 
 # What the queue holds and no record has yet; what records have and no queue asks for (chosen by name, or cut short).
