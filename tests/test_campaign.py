@@ -67,12 +67,18 @@ def run(packed, judges, folder, snapshots, monkeypatch, **settings):
 def test_the_queue_names_each_snapshot_once_and_holds_what_the_tables_need():
     snapshots = queue()
     names = [(run.name, windows) for run, windows in snapshots]
-    assert len(set(names)) == len(names)
+    assert len(set(names)) == len(names) == len({campaign._weights("", *snapshot) for snapshot in snapshots})
     asked = {(run.preset, run.window) for run, _ in snapshots}
     for preset in ("F3AMD-DCT-96", "F3AMD-FNO-96-m4", "F3AMD-FNO-96-AdaLN-zero", "CAMDM-VE", "F3AMD-FNO-96-no-IRD"):
         assert (preset, 32) in asked, preset
     assert {("F3AMD-FNO-96", 64), ("CAMDM", 64)} <= asked
     assert names[0][0] == "F3AMD-FNO-96-seed0" and names[-1] == ("F3AMD-FNO-96-seed0", 19_400_000)
+
+
+def test_nothing_is_done_after_what_is_unfinished():
+    states = iter(("kept", "unfinished", "kept"))
+    done = list(campaign._in_turn(queue()[:3], lambda *_: next(states)))
+    assert [state for *_, state in done] == ["kept", "unfinished"]
 
 
 def test_snapshots_of_one_run_are_trained_alike_whatever_comes_after_them():

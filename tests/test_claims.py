@@ -25,13 +25,16 @@ from f3amd_companion.ledger.judgements import (
     LARGER,
     OPEN,
     REMARK,
+    TOLERANCE,
     UNJUDGED,
     UNMEASURED,
     VERDICTS,
     combine,
+    equal_range,
     every,
     majority,
     ordered,
+    stated_factor,
     within,
 )
 from f3amd_companion.speed.timing import median_interval
@@ -792,3 +795,10 @@ def test_a_changed_verdict_is_noticed_until_it_is_accepted(tmp_path):
     assert change.startswith("Q13 by our records: was 'holds', is 'does not hold' (") and path.read_text() == page
     claims.write_ledger(path, fails, accept=True)
     assert claims.accepted_verdicts(path)["Q13"]["verdict"] == FAILS
+
+
+def test_slack_leaves_half_of_a_small_gain_and_is_the_same_up_and_down():
+    assert equal_range(0.25) == pytest.approx((0.8, 1.25))
+    assert stated_factor(1.04) == pytest.approx((1.02, 1.06))
+    low, high = stated_factor(10.0, 2.0)
+    assert (low, high) == pytest.approx((5.0 * (1.0 - TOLERANCE), 5.0 * (1.0 + TOLERANCE)))

@@ -241,3 +241,10 @@ def test_round_trips_between_the_three_names():
     # The signal-to-noise ratio of the VP state is alpha_bar / (1 - alpha_bar).
     alpha_bar = alpha_bar_from_sigma(sigma)
     np.testing.assert_allclose(log_snr_from_sigma(sigma), np.log(alpha_bar / (1.0 - alpha_bar)), atol=1e-11)
+
+
+def test_each_of_a_few_levels_is_drawn_as_often_as_the_next():
+    schedule = variance_preserving_cosine(4)
+    drawn = np.asarray(schedule.draw(jax.random.key(0), (4000,)))
+    shares = [np.isclose(drawn, level, rtol=1e-5).mean() for level in schedule.levels]
+    assert shares == pytest.approx([0.25] * 4, abs=0.03)
