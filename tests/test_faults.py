@@ -17,7 +17,7 @@ def listed():
 
 
 def test_there_are_faults_of_every_kind(listed):
-    assert len(listed) >= 60
+    assert len(listed) >= 180
     areas = {fault.area for fault in listed}
     assert {"formulas", "wiring", "data splits", "records", "ledger", "text to motion", "readers"} <= areas
     for fault in listed:

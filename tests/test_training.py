@@ -267,3 +267,15 @@ def test_condition_dropout_hides_history_path_and_style_together():
     for part, before in zip(hidden, condition, strict=True):
         assert not np.any(np.asarray(part)[gone])
         np.testing.assert_array_equal(np.asarray(part)[~gone], np.asarray(before)[~gone])
+
+
+def test_a_gradient_is_clipped_before_adam_sees_it():
+    """A step of 1000 and then one of 1 are two steps of 1; without clipping the second one counts for little."""
+
+    def second(clip, first):
+        optimiser = TrainingConfig(num_steps=4, gradient_clip=clip).optimiser()
+        _, state = optimiser.update(jnp.asarray(first), optimiser.init(jnp.asarray(0.0)))
+        return float(optimiser.update(jnp.asarray(1.0), state)[0])
+
+    assert second(1.0, 1000.0) == pytest.approx(second(1.0, 1.0))
+    assert abs(second(0.0, 1000.0) / second(0.0, 1.0) - 1.0) > 0.1
