@@ -95,19 +95,15 @@ def test_what_another_run_has_measured_alike_counts_and_stays_as_it_is(run, tmp_
 
 
 def test_rows_and_records_name_the_weights_of_their_own_model(tmp_path, monkeypatch):
-    monkeypatch.setattr(measure, "_records_dir", lambda profile: tmp_path)
-    monkeypatch.setattr(
-        measure, "_record", lambda *_, **told: run_record(profile="smoke", dataset="synthetic", seed=0, **told)
-    )
+    monkeypatch.setattr(measure, "records_folder", lambda profile: tmp_path)
+    record = run_record(profile="smoke", dataset="synthetic", seed=0)
     trained = {name: SimpleNamespace(params={"w": np.full(3, number)}) for number, name in enumerate("AB")}
     own = {name: weights_digest(model.params) for name, model in trained.items()}
     assert own["A"] != own["B"]
     todo, rows = [{"model": name, "steps": 8} for name in ("A", "B", "real")], pd.DataFrame({"value": [1.0]})
     path = measure._measure(
-        None, measure._record(), ["walks"], todo, lambda _: {"walks": rows}, again=(), trained=trained, other="-"
+        None, record, ["walks"], todo, lambda _: {"walks": rows}, again=(), trained=trained, other="-"
     )
     table, record = read_table(path)
     assert dict(zip(table["model"], table["weights"], strict=True)) == own | {"real": "-"}
     assert record["weights_digests"] == {name: [digest] for name, digest in (own | {"real": "-"}).items()}
-    path = measure._write_anew(None, None, "whole", table, trained)
-    assert read_table(path)[1]["weights_digests"] == {name: [digest] for name, digest in own.items()}

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from f3amd_companion.measuring import campaign
-from f3amd_companion.speed.measurements import plan
+from f3amd_companion.measuring.times import plan
 from f3amd_lib.ground.files import read_toml
 from f3amd_lib.ground.papers import load_paper_file, load_paper_table, paper_folders
 from f3amd_lib.ground.profiles import load_profile
@@ -20,9 +20,10 @@ from f3amd_lib.ground.trees import describe
 from f3amd_lib.networks.presets import find_preset
 from f3amd_lib.text.stages.acmdm_training import TextMotionTraining
 from f3amd_lib.text.stages.motionpcm_training import LatentMotionTraining
+from f3amd_lib.text.stages.train_stage import stage_recipe
 from f3amd_lib.training.checkpoints import load_model
 from f3amd_lib.training.pipeline import PRETRAINED_DIR
-from f3amd_lib.training.recipe import TrainingConfig, paper_recipe, part_recipe, profile_recipe
+from f3amd_lib.training.recipe import TrainingConfig, paper_recipe, profile_recipe
 
 PRINTED = dict(line.split()[::-1] for line in (Path(__file__).parent / "data" / "printed_numbers.sha256").open())
 LENGTH = {"num_steps", "batch_size"}
@@ -51,16 +52,19 @@ def test_what_ships_was_trained_as_presets_and_profiles_say_today(path):
 
 # Shipped model of text -> its settings and recipe; it differs in length, seed, and what its data and codec say.
 TEXT = {
-    "ACMDM-S-PS22-raw-n3": (TextMotionTraining, "short-denoiser"),
-    "MotionPCM-teacher-small": (LatentMotionTraining, "short-teacher"),
-    "MotionPCM-M1-small": (LatentMotionTraining, "short-student"),
+    "ACMDM-S-PS22-raw-n3": (TextMotionTraining, "denoiser"),
+    "MotionPCM-teacher-small": (LatentMotionTraining, "teacher"),
+    "MotionPCM-M1-small": (LatentMotionTraining, "student"),
 }
 
 
 @pytest.mark.parametrize("name", TEXT)
 def test_models_of_text_ship_as_presets_and_recipes_say_today(name):
     shipped, (settings, recipe) = describe(PRETRAINED_DIR / f"bandai/text/{name}.safetensors"), TEXT[name]
-    recorded, today = shipped["record"]["identity"]["training"], asdict(part_recipe(settings, recipe, 1, name))
+    recorded, today = (
+        shipped["record"]["identity"]["training"],
+        asdict(stage_recipe(settings, recipe, load_profile("laptop", "bandai"), name)),
+    )
     differing = {key for key in today if recorded[key] != json.loads(json.dumps(today[key]))}
     assert differing <= {"num_steps", "seed", "unit"}
     network = {key: value for key, value in find_preset(name).network.items() if key != "window"}
@@ -75,7 +79,7 @@ HELD = {
 }
 # Words alone, or what pages and bundles are made of, which tests of their own read.
 WORDS = {"claims", "commands", "readings", "schemas", "records", "colors", "claims_page", "onnx_card", "npm_packages"}
-ELSEWHERE = {"campaign", "targets", "steer"}
+ELSEWHERE = {"campaign", "targets", "steer", "released", "tags"}
 _read = functools.cache(read_toml)
 
 
@@ -137,7 +141,7 @@ def test_the_campaign_is_what_its_record_measured_and_what_waits():
 @pytest.mark.parametrize("number", [1, 4, 7])
 def test_the_suite_for_a_gpu_times_each_cell_of_the_papers_tables(number):
     timed = {
-        ("PyTorch" in one.implementation, find_preset(one.model).name, one.window, one.steps, one.characters)
+        ("PyTorch" in one.way, find_preset(one.model).name, one.window_frames, one.steps, one.characters)
         for group in plan("gpu").values()
         for one in group
         if one.precision == "tf32"
