@@ -76,6 +76,15 @@ def agree(answer, expected, *, rtol: float = 0.0, atol: float = 0.0) -> bool:
     return answer.shape == np.shape(expected) and np.allclose(answer, expected, rtol, atol)
 
 
+OTHER_ORDER = "these are the right numbers, but not in the order that is asked for"
+
+
+def reordered(found, expected, **tolerance) -> bool:
+    """Return whether an answer has the numbers expected, and has them in another order; tolerance as for `agree`."""
+    in_order = agree(found, expected, **tolerance)
+    return not in_order and agree(np.sort(found, axis=None), np.sort(expected, axis=None), **tolerance)
+
+
 def normal_quantiles(count: int) -> np.ndarray:
     """Return evenly spaced quantiles of the normal distribution, [count]: noise without chance."""
     return norm.ppf((np.arange(count) + 0.5) / count)

@@ -11,7 +11,7 @@ from f3amd_lib.networks.spectral import spectral_convolution
 from flax import nnx
 
 from f3amd_notebooks import expressivity
-from f3amd_notebooks.exercises.judging import FLOAT32, agree, numbers, read, too
+from f3amd_notebooks.exercises.judging import FLOAT32, OTHER_ORDER, agree, numbers, read, reordered, too
 
 
 def _layer_matrix(weights, num_frames: int):
@@ -68,6 +68,8 @@ def _known_ranks() -> tuple[int, ...]:
 
 def _ranks(answer) -> str | None:
     given = read(answer, (4,), "four whole numbers are asked for: two ranks, then two counts")
+    if reordered(given, _known_ranks()):
+        return f"{OTHER_ORDER}: two ranks, then two counts"
     hints = (
         "how many real numbers describe a sum of a mean and three sine waves?",
         "how many frames can a layer tell apart that cuts nothing?",

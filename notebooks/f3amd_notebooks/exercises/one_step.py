@@ -12,7 +12,7 @@ from f3amd_lib.diffusion.schedules import variance_exploding
 from scipy.optimize import brentq
 
 from f3amd_notebooks.bimodal_paths import UNKNOWN, BimodalPaths, crossing, outcome_shares
-from f3amd_notebooks.exercises.judging import agree, normal_quantiles, read, too
+from f3amd_notebooks.exercises.judging import OTHER_ORDER, agree, normal_quantiles, read, reordered, too
 
 
 def _unequal_ways(answer) -> str | None:
@@ -28,6 +28,8 @@ def _unequal_ways(answer) -> str | None:
 def _errors_of_two(answer) -> str | None:
     exact, blind = read(answer, (2,), "two numbers are asked for, in centimetres")
     right = np.sqrt(5.0**2 - 3.0**2)
+    if reordered((exact, blind), (right, 5.0), rtol=0.01):
+        return f"{OTHER_ORDER}: the exact denoiser's comes first"
     if not agree(exact, right, rtol=0.01):
         return (
             f"the exact denoiser's error is {too(exact, right)}; variances add, deviations do not: the answers' "

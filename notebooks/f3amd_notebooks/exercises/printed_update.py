@@ -13,11 +13,13 @@ from f3amd_lib.diffusion.schedules import variance_exploding
 
 from f3amd_notebooks.exercises.judging import (
     FLOAT32,
+    OTHER_ORDER,
     NotAnswered,
     agree,
     is_missing,
     normal_quantiles,
     read,
+    reordered,
     sample,
     too,
 )
@@ -141,7 +143,10 @@ def _test_of_a_sampler(answer) -> str | None:
 def _blind_network(answer) -> str | None:
     shown = read(answer, (3,), "three numbers are asked for")
     start, sigma, sigma_next = 128.0, *_SCHEDULE.grid(8)[:2]
-    for name, value, step in zip(("rescaled", "literal"), shown, (ddim_step, ddim_step_literal), strict=False):
+    steps = (ddim_step, ddim_step_literal)
+    if reordered(shown, [*(step(start, 0.3, sigma, sigma_next) for step in steps), 0.0], rtol=6e-4, atol=1e-6):
+        return f"{OTHER_ORDER}: rescaled, literal, and the distance at the end"
+    for name, value, step in zip(("rescaled", "literal"), shown, steps, strict=False):
         right = step(start, 0.3, sigma, sigma_next)
         if not agree(value, right, rtol=6e-4):
             if agree(value, step(start, 0.0, sigma, sigma_next), rtol=6e-4):

@@ -8,7 +8,18 @@ import numpy as np
 from f3amd_lib.diffusion import samplers, schedules
 from f3amd_lib.diffusion.oracles import GaussianMixture
 
-from f3amd_notebooks.exercises.judging import FLOAT32, NotAnswered, agree, normal_quantiles, numbers, read, sample, too
+from f3amd_notebooks.exercises.judging import (
+    FLOAT32,
+    OTHER_ORDER,
+    NotAnswered,
+    agree,
+    normal_quantiles,
+    numbers,
+    read,
+    reordered,
+    sample,
+    too,
+)
 
 _WIDE = GaussianMixture([-1.0, 1.0], width=0.3)
 _NARROW_PAIR = GaussianMixture([-0.1, 0.1], width=0.1)
@@ -85,9 +96,12 @@ def _numbers_of_steps(answer) -> str | None:
     steps = read(answer, (2,), asked)
     if not np.all((steps >= 1) & (steps <= _MOST_STEPS)):
         return asked
+    right = lambda sampler, count: agree(_error(sampler, schedules.variance_exploding(), round(count)), 0.001, rtol=0.1)
+    if right("heun", steps[0]) and right("euler", steps[1]):
+        return f"{OTHER_ORDER}: Euler's comes first"
     for sampler, name, count in zip(("euler", "heun"), ("Euler", "Heun"), steps, strict=True):
         error = _error(sampler, schedules.variance_exploding(), round(count))
-        if not agree(error, 0.001, rtol=0.1):
+        if not right(sampler, count):
             return (
                 f"{name} has an error of {error:.2g} after {round(count)} steps, which is {too(error, 0.001)}; "
                 "by which factor must the error change, and what does the order make of it?"
@@ -97,11 +111,15 @@ def _numbers_of_steps(answer) -> str | None:
 
 def _ancestral_shares(answer) -> str | None:
     shares = read(answer, (2, 3), "give two rows (2 to 0.5, 2 to 1.9) of three numbers: kept, fresh, sum of variances")
-    for row, sigma, sigma_next in ((shares[0], 2.0, 0.5), (shares[1], 2.0, 1.9)):
+    steps, right_shares = ((2.0, 0.5), (2.0, 1.9)), []
+    for sigma, sigma_next in steps:
         # The step is linear: what each of its inputs is multiplied by shows one at a time.
         kept = samplers.ddpm_step(1.0, 0.0, sigma, sigma_next, 0.0)
         fresh = samplers.ddpm_step(0.0, 0.0, sigma, sigma_next, 1.0)
-        expected = kept, fresh, (kept * sigma) ** 2 + fresh**2
+        right_shares.append((kept, fresh, (kept * sigma) ** 2 + fresh**2))
+    if reordered(shares, right_shares, rtol=0.02):
+        return f"{OTHER_ORDER}: a row a step, 2 to 0.5 first, and in a row kept, fresh, sum of variances"
+    for row, expected, (_, sigma_next) in zip(shares, right_shares, steps, strict=True):
         for name, value, right in zip(("a", "b", "the sum of variances"), row, expected, strict=True):
             if not agree(value, right, rtol=0.02):
                 return (

@@ -6,7 +6,7 @@ import numpy as np
 from f3amd_lib.diffusion import samplers
 from f3amd_lib.diffusion.oracles import GaussianMixture
 
-from f3amd_notebooks.exercises.judging import FLOAT32, NotAnswered, agree, numbers, sample, too
+from f3amd_notebooks.exercises.judging import FLOAT32, OTHER_ORDER, NotAnswered, agree, numbers, reordered, sample, too
 
 
 def _multistep(answer) -> str | None:
@@ -48,6 +48,8 @@ def _factors(answer) -> str | None:
         found = numbers(answer(s, sigmas.copy()))
         if found.shape != (2,):
             raise NotAnswered("return two numbers: Euler's factor and the exact one")
+        if reordered(found, (euler, exact), rtol=1e-4):
+            return f"{OTHER_ORDER}: Euler's factor comes first"
         for name, value, right in (("Euler's", found[0], euler), ("the exact", found[1], exact)):
             if not agree(value, right, rtol=1e-4):
                 return (

@@ -6,7 +6,7 @@ import numpy as np
 from f3amd_lib.diffusion.oracles import GaussianMixture
 from f3amd_lib.diffusion.schedules import log_snr_from_sigma, variance_exploding
 
-from f3amd_notebooks.exercises.judging import NotAnswered, agree, numbers, read, sample, too
+from f3amd_notebooks.exercises.judging import OTHER_ORDER, NotAnswered, agree, numbers, read, reordered, sample, too
 
 
 def _log_snr_grid(answer) -> str | None:
@@ -36,6 +36,8 @@ def _two_levels(answer) -> str | None:
     tried = np.geomspace(0.01, 5.0, 2001)
     widths = [0.04 * level / (0.04 + level**2) for level in tried]  # to find the place; the walk itself judges
     level = tried[int(np.argmax(widths))]
+    if reordered(found, (level, width(level)), rtol=0.02):
+        return f"{OTHER_ORDER}: the level comes first, then the width"
     if not agree(found[0], level, rtol=0.02):
         kept = f" (its samples are {width(found[0]):.3f} wide)" if found[0] > 0 else ""
         return f"the level is {too(found[0], level)}{kept}; x = sigma_2 eps goes in, and a share of x comes out"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from f3amd_lib.diffusion import predictions, samplers
 
-from f3amd_notebooks.exercises.judging import NotAnswered, agree, numbers, too
+from f3amd_notebooks.exercises.judging import OTHER_ORDER, NotAnswered, agree, numbers, reordered, too
 
 _CASES = ((0.5, 1.0), (3.0, 0.5), (0.05, 2.0), (20.0, 0.3))
 """Noise level and deviation of the data."""
@@ -18,6 +18,8 @@ def _preconditioning(answer) -> str | None:
         found = numbers(answer(sigma, s))
         if found.shape != (3,):
             raise NotAnswered("return three numbers: c_skip, c_out, c_in")
+        if reordered(found, expected, rtol=1e-4):
+            return f"{OTHER_ORDER}: c_skip, c_out, c_in"
         if agree(found, (sigma**2 / total**2, *expected[1:]), rtol=1e-4):
             return "with little noise D is nearly x itself, and c_skip nearly 1; yours is the other share"
         if agree(-found[1], expected[1], rtol=1e-4):
@@ -45,6 +47,8 @@ def _weights(answer) -> str | None:
         found = numbers(answer(sigma, s))
         if found.shape != (3,):
             raise NotAnswered("return three weights: for eps, for v, for Karras et al.")
+        if reordered(found, expected, rtol=1e-3):
+            return f"{OTHER_ORDER}: for eps, for v, for Karras et al."
         if agree(found, 1 / np.asarray(expected), rtol=1e-3):
             return "this is c_out^2; the loss of F is that of D divided by it"
         if agree(found**2, expected, rtol=1e-3):

@@ -5,7 +5,16 @@ from __future__ import annotations
 import numpy as np
 from f3amd_lib.diffusion.oracles import GaussianMixture
 
-from f3amd_notebooks.exercises.judging import FLOAT32, NotAnswered, agree, normal_quantiles, numbers, too
+from f3amd_notebooks.exercises.judging import (
+    FLOAT32,
+    OTHER_ORDER,
+    NotAnswered,
+    agree,
+    normal_quantiles,
+    numbers,
+    reordered,
+    too,
+)
 
 
 def _velocity(answer) -> str | None:
@@ -38,6 +47,8 @@ def _lengths(answer) -> str | None:
         found = numbers(answer(s))
         if found.shape != (2,):
             raise NotAnswered("return two numbers: by chance, and after one reflow")
+        if reordered(found, right, rtol=0.01, atol=0.005):
+            return f"{OTHER_ORDER}: by chance comes first, which makes longer lines"
         for name, value, expected in zip(("by chance", "after one reflow"), found, right, strict=True):
             if not agree(value, expected, rtol=0.01, atol=0.005):
                 return (

@@ -6,7 +6,7 @@ import numpy as np
 from f3amd_lib.diffusion.oracles import GaussianMixture
 from f3amd_lib.diffusion.predictions import guided
 
-from f3amd_notebooks.exercises.judging import FLOAT32, NotAnswered, agree, numbers, too
+from f3amd_notebooks.exercises.judging import FLOAT32, OTHER_ORDER, NotAnswered, agree, numbers, reordered, too
 
 
 def _guided_guess(answer) -> str | None:
@@ -40,9 +40,10 @@ def _widths(answer) -> str | None:
         if found.shape != (2,):
             raise NotAnswered("return two numbers: of the tilted density, and of the guided samples")
         told, crowd = GaussianMixture([0.7], width=s), GaussianMixture([0.0], width=wide)
-        for name, value, expected in zip(
-            ("tilted density", "guided samples"), found, (_tilted(told, crowd, w), _guided(told, crowd, w)), strict=True
-        ):
+        right = _tilted(told, crowd, w), _guided(told, crowd, w)
+        if reordered(found, right, rtol=0.01):
+            return f"{OTHER_ORDER}: of the tilted density, then of the guided samples"
+        for name, value, expected in zip(("tilted density", "guided samples"), found, right, strict=True):
             if not agree(value, expected, rtol=0.01):
                 return (
                     f"at s = {s:g}, S = {wide:g}, w = {w:g} the width of the {name} is {too(value, expected)}; "

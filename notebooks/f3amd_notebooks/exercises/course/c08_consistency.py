@@ -46,9 +46,17 @@ def _target(answer) -> str | None:
             return "the neighbour lies at the lower level, and the student has to be told so"
         if agree(found, student(x, lower, edge), **FLOAT32) or agree(found, student(x, sigma, edge), **FLOAT32):
             return "the student is asked about x itself; the target is its answer at the neighbour"
-        if agree(found, student(denoise(x, sigma), lower, edge), **FLOAT32):
+        guess = denoise(x, sigma)
+        if agree(found, guess, **FLOAT32) or agree(found, student(guess, lower, edge), **FLOAT32):
             return "the best guess is no neighbour: the teacher steps to the lower level only"
-        return f"for the step from {sigma:g} to {lower:g} with the edge at {edge:g} the target is another one"
+        if any(agree(found, student(neighbour, *told), **FLOAT32) for told in ((edge, lower), (edge, edge))):
+            return "the student is told the wrong levels: first that of the neighbour, then the edge"
+        away = x - guess
+        for wrong in (guess + sigma / lower * away, x + (lower - sigma) * away, x + lower / sigma * guess):
+            if agree(found, wrong if lower <= edge else student(wrong, lower, edge), **FLOAT32):
+                return "the neighbour is wrong: DDIM keeps the share lower / sigma of x - D, see C3.1"
+        which = "the neighbour itself" if lower <= edge else "the student's answer at the neighbour"
+        return f"from {sigma:g} to {lower:g} with the edge at {edge:g} the target is {which}, and this is another point"
     return None
 
 

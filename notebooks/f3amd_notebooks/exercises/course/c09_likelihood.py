@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from f3amd_lib.diffusion.oracles import GaussianMixture
 
-from f3amd_notebooks.exercises.judging import FLOAT32, NotAnswered, agree, numbers, too
+from f3amd_notebooks.exercises.judging import FLOAT32, NotAnswered, agree, numbers, reordered, too
 
 _MIXTURE = GaussianMixture([[-1.0, 0.0], [1.5, 0.5], [0.3, -1.2]], width=0.4, weights=[0.3, 0.5, 0.2])
 
@@ -77,7 +77,7 @@ def _one_probe(answer) -> str | None:
         if found.shape != (2,):
             raise NotAnswered("return two numbers: with random signs, and with a normal probe")
         right = np.array([signs, normal])
-        if agree(found, right[::-1], rtol=1e-3, atol=1e-6):
+        if reordered(found, right, rtol=1e-3, atol=1e-6):
             return "these are the two, but in the other order: for a diagonal matrix random signs make no error"
         if agree(found, right**2, rtol=1e-3, atol=1e-6):
             return "these are the variances; the standard deviation is asked for"
