@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 from f3amd_notebooks.exercises import CHECKS, hint
+from f3amd_notebooks.labs import LABS
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 PLAN, SEMESTER = ((DOCS / f"{name}.md").read_text(encoding="utf-8") for name in ("lesson_plan", "semester"))
@@ -31,6 +32,7 @@ def test_every_exercise_is_planned_once_and_has_an_expected_answer():
     assert list(ANSWERS) == IN_SESSIONS and all(ANSWERS.values())
     named = re.findall(r"\bC\d+\.[a-z]\b", SEMESTER)
     assert sorted(named) == sorted(number for number in CHECKS if number.startswith("C"))
+    assert sorted(re.findall(r"\bL\d+\b", SEMESTER)) == sorted(LABS)
 
 
 @pytest.mark.parametrize("number", NUMERIC)

@@ -1,0 +1,122 @@
+"""What the judges of the labs share: denoisers drawn from a seed, which count their evaluations, and verdicts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from f3amd_lib.diffusion.oracles import GaussianMixture
+from f3amd_lib.diffusion.samplers import SAMPLERS
+from f3amd_lib.diffusion.schedules import variance_exploding
+
+from f3amd_notebooks.exercises.judging import NotAnswered, numbers
+
+TOP, BOTTOM = 80.0, 0.01
+"""Noise levels between which hidden denoisers are walked."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What a judge measured, a row a case or a sampler, and what is wrong with the answer, or None if it passes."""
+
+    table: pd.DataFrame
+    fault: str | None
+
+
+class Counted:
+    """A denoiser that counts how often it is asked, whatever the number of points; `most` times at most."""
+
+    def __init__(self, denoise: Callable, most: int):
+        self.denoise, self.most, self.used = denoise, most, 0
+
+    def __call__(self, x, sigma):
+        self.used += 1
+        if self.used > self.most:
+            raise NotAnswered(f"a denoiser was asked more than {self.most} times: more evaluations than anybody needs")
+        return self.denoise(x, sigma)
+
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """A mixture whose modes lie on a line in D dimensions: along it the flow is known, across it a Gaussian's.
+
+    Attributes:
+      name: what the data are like.
+      along: the mixture on the line, D = 1.
+      axis: direction of the line, [D], of length 1.
+    """
+
+    name: str
+    along: GaussianMixture
+    axis: np.ndarray
+
+    @property
+    def whole(self) -> GaussianMixture:
+        """The mixture in D dimensions."""
+        return GaussianMixture(self.along.means * self.axis, self.along.width, self.along.weights)
+
+    def flow(self, x, sigma: float, lower: float) -> np.ndarray:
+        """Carry points [N, D] along the flow without error."""
+        place = x @ self.axis
+        across = (
+            (x - place[:, None] * self.axis) * np.hypot(self.along.width, lower) / np.hypot(self.along.width, sigma)
+        )
+        return across + self.along.flow(place[:, None], sigma, lower) * self.axis
+
+
+def hidden_data(rng: np.random.Generator) -> list[Line]:
+    """Draw data of four kinds: narrow modes, wide ones, uneven ones, and two modes in 64 dimensions."""
+    far, size = rng.uniform(0.8, 1.4), np.exp(rng.uniform(-0.2, 0.2, 4))
+    axis = rng.standard_normal(64)
+    one = np.ones(1)
+    return [
+        Line("narrow", GaussianMixture([-far, far], width=0.06 * size[0]), one),
+        Line("wide", GaussianMixture(rng.uniform(-1, 1, 2), width=1.2 * size[1]), one),
+        Line("uneven", GaussianMixture([-1.5 * far, 0.2, far], 0.2 * size[2], rng.uniform(0.5, 2.0, 3)), one),
+        Line("64 dimensions", GaussianMixture([-4 * far, 4 * far], 0.5 * size[3]), axis / np.linalg.norm(axis)),
+    ]
+
+
+def known(name: str, denoise: Callable, x, grid, rng: np.random.Generator | None = None) -> np.ndarray:
+    """Walk points down a grid with a sampler of the library, in numpy and float64."""
+    sampler = SAMPLERS[name]
+    for number, (sigma, lower) in enumerate(zip(grid[:-1], grid[1:], strict=True)):
+        step = sampler.last if sampler.last and number == len(grid) - 2 else sampler.step
+        noise = rng.standard_normal(x.shape) if sampler.draws_noise else None
+        x = step(x, denoise(x, sigma), sigma, lower, denoise, noise)
+    return x
+
+
+def grid_of(rho: float, count: int, top: float = TOP, bottom: float = BOTTOM) -> np.ndarray:
+    """Return count + 1 levels that are even in sigma^(1 / rho); infinite rho is even in log sigma."""
+    if np.isinf(rho):
+        return np.geomspace(top, bottom, count + 1)
+    return variance_exploding(top, bottom, rho).grid(count + 1)[:-1]
+
+
+def made(denoise) -> Callable:
+    """Return a denoiser that an answer made; NotAnswered if it made none."""
+    if not callable(denoise):
+        raise NotAnswered("your function returns nothing yet" if denoise in (None, ...) else "a function is asked for")
+    return denoise
+
+
+def points(found, shape: tuple[int, ...]) -> np.ndarray:
+    """Read an answer that is made of finite numbers of this shape.
+
+    Raises:
+      NotAnswered: for anything else.
+    """
+    found = numbers(found)
+    if found.shape != shape:
+        raise NotAnswered(f"an array of shape {shape} is asked for, and this one has shape {found.shape}")
+    if not np.isfinite(found).all():
+        raise NotAnswered("not all numbers are finite")
+    return found
+
+
+def geometric(values) -> float:
+    """Return the geometric mean."""
+    return float(np.exp(np.mean(np.log(np.maximum(values, 1e-300)))))
