@@ -73,7 +73,7 @@ def guide_without_overshoot(answer, rng: np.random.Generator) -> Verdict:
         break
     if fault is None and mine["evaluations"] > 2000:
         fault = f"{mine['evaluations']} evaluations are used, 2000 are allowed"
-    return Verdict(pd.DataFrame(rows).T.rename_axis("sampler").reset_index(), fault)
+    return Verdict(pd.DataFrame(rows).T.astype({"evaluations": int}).rename_axis("sampler").reset_index(), fault)
 
 
 _WALKS = ("Neutral", "March", "Tiptoe", "Sleepy", "Happy", "Shuffling", "Stomping", "Texting", "Relaxed")
@@ -140,7 +140,8 @@ def one_toe_is_measured(answer, rng: np.random.Generator) -> Verdict:
     elif mine["right off (widths)"] > 0.4:
         fault = (f"the right toe does not listen: its heights lie {mine['right off (cm)']:.1f} cm off those that "
                  "go with this left toe")  # fmt: skip
-    return Verdict(pd.DataFrame(rows).T.rename_axis(", ".join(styles)).reset_index(), fault)
+    table = pd.DataFrame(rows).T.astype({"evaluations": int}).rename_axis(", ".join(styles))
+    return Verdict(table.reset_index(), fault)
 
 
 @functools.cache

@@ -145,7 +145,7 @@ def fresh_noise(answer, rng: np.random.Generator) -> Verdict:
             row[case] = one.std() / expected
             row["alike"] = max(row.get("alike", -1.0), float(np.corrcoef(one.ravel(), two.ravel())[0, 1]))
         rows[name] = row | {"evaluations": denoise.used // 2}
-    table = pd.DataFrame(rows).T.rename_axis("width left").reset_index()
+    table = pd.DataFrame(rows).T.astype({"evaluations": int}).rename_axis("width left").reset_index()
     mine = rows["your sampler"]
     fault = None
     if mine["evaluations"] > len(grid):
