@@ -4,12 +4,14 @@ import functools
 import re
 from pathlib import Path
 
+import jax
 import nbformat
 import numpy as np
 import pytest
 from f3amd_notebooks.labs import LABS, judge
-from f3amd_notebooks.labs.judging import grid_of, known
+from f3amd_notebooks.labs.judging import Counted, grid_of, hidden_data, known
 
+from f3amd_lib.diffusion import samplers
 from f3amd_lib.diffusion.predictions import guided
 
 COURSE = Path(__file__).resolve().parents[1] / "notebooks" / "course"
@@ -142,7 +144,7 @@ WRONG["L4"] = [
     (steps(lambda tolerance: 8), "8 evaluations whatever is asked"),
     (steps(lambda tolerance: 600), "600 evaluations whatever is asked"),
     (lambda *given: of("L4")["answer"](*given[:4], 10 * given[4]), "tolerance is missed"),
-    (lambda *given: of("L4")["answer"](*given[:4], 1e-2 * given[4]), "too many evaluations"),
+    (lambda *given: of("L4")["answer"](*given[:4], 0.02 * given[4]), "too many evaluations"),
     (lambda *given: of("L4")["answer"](*given[:4], 1e-9), "more than"),
 ]
 
@@ -274,7 +276,7 @@ WRONG["L9"] = [
     (at_the_end, "does not listen"),
     (put_in, "does not listen"),
     (mean_of_the_right, "lost its spread"),
-    (solution("L9", staying=60), "evaluations"),
+    (solution("L9", staying=45), "evaluations"),
 ]
 
 
@@ -297,6 +299,18 @@ WRONG["L10"] = [
 )
 def test_a_wrong_answer_fails_for_its_reason(number, answer, reason):
     assert reason in (judge(number, answer, 4).fault or "passed")
+
+
+def test_evaluations_are_counted_in_rows_and_not_inside_a_compiled_walk():
+    scan = lambda denoise, x, top, bottom, count: samplers.sample("ddim", denoise, x, np.geomspace(top, bottom, 9))
+    assert "cannot be counted" in judge("L1", scan, 0).fault
+    at_once = lambda denoise, x, *given: of("L1")["answer"](
+        lambda y, s: denoise(np.tile(y, (3, 1)), s)[: len(y)], x, *given
+    )
+    assert "24 evaluations" in judge("L1", at_once, 0).fault
+    asked = Counted(hidden_data(np.random.default_rng(0))[0].whole.denoise, 10)
+    slope = jax.vmap(jax.grad(lambda place: asked(place[None], 0.5)[0]))(np.ones(4))
+    assert slope.shape == (4,) and asked.used == 1
 
 
 def test_five_wrong_answers_are_tried_in_every_lab():

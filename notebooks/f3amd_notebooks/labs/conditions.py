@@ -45,7 +45,7 @@ def guide_without_overshoot(answer, rng: np.random.Generator) -> Verdict:
         middle = weights @ places / weights.sum()
         spread = np.sqrt(weights @ (places - middle) ** 2 / weights.sum())
         for name, walk in walks.items():
-            both = Counted(told.denoise, 3000), Counted(crowd.denoise, 3000)
+            both = Counted(told.denoise, 3000, count), Counted(crowd.denoise, 3000, count)
             start = grid[0] * rng.standard_normal((count, 1))
             found = points(walk(*both, start, w, grid, np.random.default_rng(rng.integers(2**31))), start.shape)[:, 0]
             row = rows.setdefault(name, {})
@@ -115,7 +115,7 @@ def one_toe_is_measured(answer, rng: np.random.Generator) -> Verdict:
         mean = weights @ places / weights.sum()
         spread = np.sqrt(weights @ (places - mean) ** 2 / weights.sum())
         for name, walk in walks.items():
-            denoise = Counted(both.denoise, 2500)
+            denoise = Counted(both.denoise, 2500, count)
             start = grid[0] * rng.standard_normal((count, 2))
             found = points(
                 walk(denoise, start, observed, grid, np.random.default_rng(rng.integers(2**31))), start.shape

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import jax
 import numpy as np
 import pandas as pd
 from f3amd_lib.diffusion.oracles import GaussianMixture
@@ -26,16 +27,34 @@ class Verdict:
 
 
 class Counted:
-    """A denoiser that counts how often it is asked, whatever the number of points; `most` times at most."""
+    """A denoiser that counts how often it is asked.
 
-    def __init__(self, denoise: Callable, most: int):
-        self.denoise, self.most, self.used = denoise, most, 0
+    Attributes:
+      most: asked more often, it refuses.
+      rows: points of one evaluation; a call with twice as many counts twice. By default every call counts once.
+      used: evaluations until now.
+    """
+
+    def __init__(self, denoise: Callable, most: int, rows: int | None = None):
+        self.denoise, self.most, self.rows, self.used = denoise, most, rows, 0
 
     def __call__(self, x, sigma):
-        self.used += 1
+        if _is_compiled(x) or _is_compiled(sigma):
+            raise NotAnswered("inside jax.jit or lax.scan evaluations cannot be counted: walk in plain Python")
+        self.used += 1 if self.rows is None else -(-len(x) // self.rows)
         if self.used > self.most:
             raise NotAnswered(f"a denoiser was asked more than {self.most} times: more evaluations than anybody needs")
         return self.denoise(x, sigma)
+
+
+def _is_compiled(x) -> bool:
+    """Return whether a program is being written down with x in it; derivatives alone are no obstacle."""
+    while isinstance(x, jax.core.Tracer):
+        if hasattr(x, "primal") or hasattr(x, "batch_dim"):
+            x = x.primal if hasattr(x, "primal") else x.val
+        else:
+            return True
+    return False
 
 
 @dataclass(frozen=True, eq=False)

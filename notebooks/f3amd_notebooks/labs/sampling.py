@@ -45,7 +45,7 @@ def eight_evaluations(answer, rng: np.random.Generator) -> Verdict:
     for budget in (8, 32, 64, 128):
         found = []
         for line, x, end in cases:
-            denoise = Counted(line.whole.denoise, 20 * budget)
+            denoise = Counted(line.whole.denoise, 20 * budget, len(x))
             ends = points(answer(denoise, x.copy(), TOP, BOTTOM, budget), x.shape)
             found.append(np.abs(ends - end).mean())
             over += [(budget, denoise.used)] if denoise.used > budget else []
@@ -137,7 +137,7 @@ def fresh_noise(answer, rng: np.random.Generator) -> Verdict:
             state = data.sample(rng, count)
             state = state + grid[0] * rng.standard_normal(state.shape)
             seeds = rng.integers(2**31, size=2)
-            denoise = Counted(data.denoise, 4 * len(grid))
+            denoise = Counted(data.denoise, 8 * len(grid), count)
             one, two = (points(walk(denoise, state.copy(), grid, np.random.default_rng(s)), state.shape) for s in seeds)
             expected = np.sqrt(
                 np.mean(np.var(data.means.T @ np.eye(len(data.means)), axis=1)) + data.width**2 + grid[-1] ** 2
@@ -173,7 +173,7 @@ def to_a_tolerance(answer, rng: np.random.Generator) -> Verdict:
     rows, faults = [], []
     for line, x, end in _starts(hidden_data(rng), rng, 40):
         for tolerance in (0.03, 0.003):
-            denoise = Counted(line.whole.denoise, 6000)
+            denoise = Counted(line.whole.denoise, 6000, len(x))
             ends = points(answer(denoise, x.copy(), TOP, BOTTOM, tolerance), x.shape)
             error = lambda ends, end=end: float(np.abs(ends - end).mean())
             row = {"data": line.name, "tolerance": tolerance, "error": error(ends), "evaluations": denoise.used}
