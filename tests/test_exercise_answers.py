@@ -384,7 +384,10 @@ def _round_by_round(a, beta, rounds):
     return error
 
 
-RIGHT["C10.a"] = [_round_by_round, lambda a, beta, rounds: beta * rounds if a == 1 else beta * (a**rounds - 1) / (a - 1)]
+RIGHT["C10.a"] = [
+    _round_by_round,
+    lambda a, beta, rounds: beta * rounds if a == 1 else beta * (a**rounds - 1) / (a - 1),
+]
 WRONG["C10.a"] = [lambda a, beta, rounds: rounds * beta, lambda a, beta, rounds: beta * a**rounds]
 
 
