@@ -102,9 +102,11 @@ def known(name: str, denoise: Callable, x, grid, rng: np.random.Generator | None
     """Walk points down a grid with a sampler of the library, in numpy and float64."""
     sampler = SAMPLERS[name]
     for number, (sigma, lower) in enumerate(zip(grid[:-1], grid[1:], strict=True)):
-        step = sampler.last if sampler.last and number == len(grid) - 2 else sampler.step
-        noise = rng.standard_normal(x.shape) if sampler.draws_noise else None
-        x = step(x, denoise(x, sigma), sigma, lower, denoise, noise)
+        ends = sampler.last and number == len(grid) - 2
+        more = (
+            [] if ends else [rng.standard_normal(x.shape)] * sampler.draws_noise + [denoise] * (sampler.evaluations > 1)
+        )
+        x = (sampler.last if ends else sampler.step)(x, denoise(x, sigma), sigma, lower, *more)
     return x
 
 
