@@ -1,11 +1,13 @@
 """The map from equations to code, and the list of open points."""
 
 import ast
+import functools
 import json
 
 import pandas as pd
 import pytest
 
+from f3amd_companion.ledger import equation_map as map_module
 from f3amd_companion.ledger.equation_map import (
     equation_labels,
     equation_map,
@@ -20,6 +22,16 @@ from f3amd_lib.ground.profiles import repository_root
 from f3amd_lib.ground.records import run_record, write_table
 from f3amd_lib.networks.f3amd import F3AMDConfig
 from f3amd_lib.papers.readings import fill_reading, readings_table
+
+
+@pytest.fixture(scope="module", autouse=True)
+def files_are_read_once():
+    """Each file is parsed, and each folder looked through, once for all tests."""
+    documented = map_module._documented
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(map_module, "_documented", functools.cache(lambda path: tuple(documented(path))))
+        patch.setattr(map_module, "_places", functools.cache(map_module._places))
+        yield
 
 
 @pytest.mark.parametrize(
