@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiled import Compiled
 from flax import nnx
 
 from f3amd_lib.networks import conditioning
@@ -109,7 +110,8 @@ def test_section_3_3_cross_attention_equals_a_plain_loop(num_heads):
                 weight = np.exp(keys[:, part] @ query[part] / np.sqrt(each))
                 answer[part] = weight @ values[:, part] / weight.sum()
             expected[b, t] = asked + linear(encoder.output, answer)
-    got = encoder(encoder.encode(condition), jnp.asarray(sigma))
+    encoder = Compiled(encoder)
+    got = encoder(encoder.encode(condition), np.asarray(sigma, np.float32))
     np.testing.assert_allclose(got, expected, atol=2e-5)
 
 
@@ -138,17 +140,17 @@ def test_eq05_to_eq07_equal_plain_numpy():
     mixed = linear(film.modulation, c)
     gamma, beta = mixed[..., :WIDTH], mixed[..., WIDTH:]
     expected = silu(linear(film.output, z * (1.0 + np.tanh(gamma)) + beta))
-    np.testing.assert_allclose(film.modulate(z, c), expected, atol=1e-5)
+    np.testing.assert_allclose(Compiled(film).modulate(z, c), expected, atol=1e-5)
     # As a layer of a block it modulates what the base block returns.
-    np.testing.assert_array_equal(film(lambda z: 2.0 * z, z / 2.0, c), film.modulate(z, c))
+    np.testing.assert_array_equal(film(lambda z: 2.0 * z, z / 2.0, c), Compiled(film).modulate(z, c))
 
 
 def test_table_11_concatenation_is_the_base_block_and_the_output_layer():
     layer = randomise(Concatenation(WIDTH, rngs=nnx.Rngs(params=0)))
     z, c = draw(2, 2 * WINDOW, WIDTH), draw(2, WINDOW, WIDTH, seed=1)
     expected = silu(linear(layer.output, np.sin(z)))
-    np.testing.assert_allclose(layer(jnp.sin, z, c), expected, atol=1e-5)
-    np.testing.assert_array_equal(layer(jnp.sin, z, c + 1.0), layer(jnp.sin, z, c))
+    np.testing.assert_allclose(Compiled(layer)(jnp.sin, z, c), expected, atol=1e-5)
+    np.testing.assert_array_equal(Compiled(layer)(jnp.sin, z, c + 1.0), Compiled(layer)(jnp.sin, z, c))
 
 
 def make_base(kind, num_frames=WINDOW):
@@ -161,7 +163,7 @@ def make_base(kind, num_frames=WINDOW):
 def test_table_11_adaln_zero_starts_as_the_identity(kind):
     base, layer = make_base(kind), AdaLNZero(WIDTH, 5, rngs=nnx.Rngs(params=0))
     z, c = draw(2, WINDOW, WIDTH), 100.0 * draw(2, WINDOW, 5, seed=1)
-    np.testing.assert_array_equal(layer(base, z, c), z)
+    np.testing.assert_array_equal(Compiled(layer)(base, z, c), z)
     gradient = nnx.jit(nnx.grad(lambda layer: jnp.sum(layer(base, z, c) ** 2)))(layer)
     # Only the gate can move at first, and it does.
     parts = np.split(np.asarray(gradient["modulation"]["kernel"][...]), 3, axis=-1)
@@ -176,7 +178,7 @@ def test_table_11_adaln_zero_equals_plain_numpy():
     centred = z - z.mean(axis=-1, keepdims=True)
     normalised = centred / np.sqrt((centred**2).mean(axis=-1, keepdims=True))
     expected = z + gate * np.sin(normalised * (1.0 + scale) + shift)
-    np.testing.assert_allclose(layer(jnp.sin, z, c), expected, atol=1e-5)
+    np.testing.assert_allclose(Compiled(layer)(jnp.sin, z, c), expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("num_heads", [1, 2])
@@ -186,7 +188,7 @@ def test_table_11_cross_attention_is_added_to_the_base_block(num_heads):
     z_base, code = np.sin(z), position_code(0, WINDOW, WIDTH).astype(np.float32)
     z_tilde = z_base + np.asarray(layer.attention(z_base + code, c))
     expected = silu(linear(layer.output, z_tilde))
-    np.testing.assert_allclose(layer(jnp.sin, z, c), expected, atol=1e-5)
+    np.testing.assert_allclose(Compiled(layer)(jnp.sin, z, c), expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", CONDITIONINGS)

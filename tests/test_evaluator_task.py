@@ -98,13 +98,13 @@ def test_each_layer_is_pytorchs_own():
     config = dataclasses.replace(SMALL, released=True, tag_width=3)
     graph, params = nnx.split(TextMotionNetwork(config, rngs=nnx.Rngs(0)))
     rng = np.random.default_rng(1)
-    params = jax.tree.map(lambda leaf: jnp.asarray(0.3 * rng.standard_normal(leaf.shape), leaf.dtype), params)
+    params = jax.tree.map(lambda leaf: (0.3 * rng.standard_normal(leaf.shape)).astype(leaf.dtype), params)
     network = nnx.merge(graph, params)
     for part in (network.motion, network.text):
         part.middle.kernel[...], part.middle.bias[...] = 1e-3 * part.middle.kernel[...], 1e-3 * part.middle.bias[...]
-    motion, lengths = np.array(draw(2, 24, 5, seed=2)), (12, 19)
+    motion, lengths, network = np.array(draw(2, 24, 5, seed=2)), (12, 19), Compiled(network)
     motion[0, 12:], motion[1, 19:] = 0.0, 0.0
-    made = network.embed_motion(jnp.asarray(motion), jnp.array(lengths))
+    made = network.embed_motion(motion, np.array(lengths))
     for seen, length, answer in zip(motion, lengths, made, strict=True):
         once = halved(network.movement[0], seen)
         np.testing.assert_allclose(network.movement[0](seen[None])[0], once, atol=1e-5)
@@ -119,7 +119,7 @@ def test_each_layer_is_pytorchs_own():
     for given in ((words, mask), (words, mask, tags)):
         tagged = words + linear(network.tags, tags) if len(given) == 3 else words
         wanted = [both_ways(network.text, row[kept]) for row, kept in zip(tagged, mask, strict=True)]
-        np.testing.assert_allclose(network.embed_text(*map(jnp.asarray, given)), wanted, atol=1e-4)
+        np.testing.assert_allclose(network.embed_text(*given), wanted, atol=1e-4)
 
 
 def test_time_has_a_direction(network):
@@ -180,8 +180,8 @@ def test_it_learns_what_captions_tell_and_not_what_they_do_not():
 
 def test_a_batch_carries_the_captions_of_its_clips():
     task = toy(True)
-    (motion, captions), _ = task.draw(None, jax.random.key(3))
-    again = draw_clips(jax.random.split(jax.random.key(3))[0], task.clips, 16, 48)
+    (motion, captions), _ = jax.jit(task.draw)(None, jax.random.key(3))
+    again = jax.jit(draw_clips, static_argnums=(2, 3))(jax.random.split(jax.random.key(3))[0], task.clips, 16, 48)
     assert np.array_equal(motion.caption, again.caption)
     assert np.array_equal(captions.pair, task.captions.pair[motion.caption])
     rate = np.abs(np.diff(np.unwrap(np.arctan2(motion.motion[:, :20, 0], motion.motion[:, :20, 1]), axis=1)))

@@ -7,6 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from builders import refused
+from compiled import Compiled
+from flax import nnx
 from safetensors.numpy import save_file
 from scipy.special import erf, expit
 
@@ -175,8 +177,6 @@ MILLIONS = {
     "acmdm-autoencoder": (autoencoder_shapes(), 17.08),
     "acmdm": (acmdm_shapes(), 39.1),
     "acmdm XL": (acmdm_shapes(20), 596.4),
-    "acmdm L": (acmdm_shapes(16), 306.4),
-    "acmdm B": (acmdm_shapes(12), 130.1),
     "motionlcm-teacher": (motionlcm_shapes(part="teacher"), 8.24),
     "motionlcm-student": (motionlcm_shapes(), 8.44),
     "acmdm-clip-evaluator": (clip_shapes(), 59.5),
@@ -364,6 +364,10 @@ def attended(query, key, value, heads):
     return answer.swapaxes(0, 1).reshape(answer.shape[1], -1)
 
 
+def single(x):
+    return np.asarray(x, np.float32)[None]
+
+
 def close(found, wanted):
     np.testing.assert_allclose(found, wanted, atol=2e-4, rtol=2e-4)
 
@@ -394,12 +398,13 @@ def test_acmdm_computes_what_the_released_network_does(family, folder):
         wanted = x.reshape(frames, 11, 4, 2).swapaxes(2, 3).reshape(frames, 22, 4)
     else:
         wanted = x.reshape(frames, 22, 4)
-    network, mask = model.network(), jnp.ones((1, frames), bool)
-    condition = acmdm.TextCondition(jnp.asarray(text, jnp.float32)[None], mask)
-    state, time = jnp.asarray(state, jnp.float32)[None], jnp.array([time])
+    network, mask = Compiled(model.network()), np.ones((1, frames), bool)
+    condition = acmdm.TextCondition(single(text), mask)
+    state, time = single(state), np.array([time], np.float32)
     if family == "acmdm-control":
-        asked = acmdm.Control(jnp.asarray(control, jnp.float32)[None], None, jnp.ones(1))
-        found = acmdm.controlled(network, model.control_branch(), condition, asked)(state, time)
+        asked = acmdm.Control(single(control), None, np.ones(1, np.float32))
+        answer = nnx.jit(lambda network, branch, *given: acmdm.controlled(network, branch, condition, asked)(*given))
+        found = answer(network.network, model.control_branch(), state, time)
     else:
         found = network(state, time, network.encode(condition))
     close(found[0], wanted)
@@ -424,15 +429,15 @@ def test_the_autoencoder_computes_what_the_released_one_does(preset, encoded, fo
         x = torch.convolution(f"encoder.model.{first}", x, stride=2)
         for number, dilation in enumerate((9, 3, 1), first + 1):
             x = residual(f"encoder.model.{number}", x, dilation)
-    network = network_with(codec.autoencoder, codec.params)
-    close(network.encode(jnp.asarray(positions, jnp.float32)[None])[0], torch.convolution("encoder.conv_out", x))
+    network = Compiled(network_with(codec.autoencoder, codec.params))
+    close(network.encode(single(positions))[0], torch.convolution("encoder.conv_out", x))
     x = torch.convolution("decoder.conv_in", latent)
     for first in (0, 4):
         for number, dilation in enumerate((9, 3, 1), first):
             x = residual(f"decoder.model.{number}", x, dilation)
         x = torch.convolution(f"decoder.model.{first + 3}.conv", np.repeat(x, 2, axis=0))
     wanted = torch.convolution("decoder.conv_out2", silu(torch.convolution("decoder.conv_out1", x)))
-    close(network.decode(jnp.asarray(latent, jnp.float32)[None])[0], wanted)
+    close(network.decode(single(latent))[0], wanted)
 
 
 @pytest.mark.parametrize("family", ["motionlcm-teacher", "motionlcm-student"])
@@ -449,11 +454,12 @@ def test_motionlcm_computes_what_the_released_networks_do(family, folder):
     )
     x = np.stack([*torch.linear("denoiser.latent_pre", latent), told, torch.linear("denoiser.emb_proj.1", text)])
     x = torch.skip("denoiser.encoder", x + place("denoiser.query_pos", 5))
-    network, single = model.network(), lambda x: jnp.asarray(x, jnp.float32)[None]
+    network = Compiled(model.network())
     options = {"guidance": guidance} if family == "motionlcm-student" else {}
-    found = network(single(latent), jnp.array([time]), network.encode(single(text)), **options)
+    found = network(single(latent), np.array([time]), network.encode(single(text)), **options)
     close(found[0], torch.linear("denoiser.latent_post", x[:3]))
-    coder, mask = network_with(model.autoencoder, model.autoencoder_params), jnp.ones((1, 6), bool)
+    coder = Compiled(network_with(model.autoencoder, model.autoencoder_params))
+    mask = np.ones((1, 6), bool)
     x = np.concatenate([torch.arrays["vae.global_motion_token"], torch.linear("vae.skel_embedding", frames)])
     x = torch.skip("vae.encoder", x + place("vae.query_pos_encoder", 12))
     close(np.concatenate(coder.encode(single(frames), mask), axis=1)[0], torch.linear("vae.latent_pre", x[:6]))
@@ -462,7 +468,7 @@ def test_motionlcm_computes_what_the_released_networks_do(family, folder):
 
 
 def test_the_evaluator_computes_what_the_released_one_does(folder):
-    network, torch = read(folder, "evaluator").network(), Torch(random_arrays(SMALL["evaluator"]))
+    network, torch = Compiled(read(folder, "evaluator").network()), Torch(random_arrays(SMALL["evaluator"]))
     rng = np.random.default_rng(5)
     motion, words, tags = rng.normal(size=(12, 259)), rng.normal(size=(5, 9)), np.eye(3)[[0, 1, 2, 0, 1]]
     x = motion
@@ -473,9 +479,8 @@ def test_the_evaluator_computes_what_the_released_one_does(folder):
         x = x + torch.arrays[f"movement_encoder.main.{number}.bias"]
         x = np.where(x > 0, x, 0.2 * x)
     wanted = torch.recurrence("motion_encoder", torch.linear("movement_encoder.out_net", x))
-    close(network.embed_motion(jnp.asarray(motion, jnp.float32)[None], jnp.array([12]))[0], wanted)
-    single = lambda x: jnp.asarray(x, jnp.float32)[None]
-    found = network.embed_text(single(words), jnp.ones((1, 5), bool), single(tags))
+    close(network.embed_motion(single(motion), np.array([12]))[0], wanted)
+    found = network.embed_text(single(words), np.ones((1, 5), bool), single(tags))
     close(found[0], torch.recurrence("text_encoder", words + torch.linear("text_encoder.pos_emb", tags)))
 
 
@@ -524,7 +529,7 @@ def test_words_are_glove_vectors_with_their_part_of_speech(folder, tmp_path, cac
 def test_a_judge_reads_tags_behind_the_numbers_of_a_word(folder):
     judge, rng = read(folder, "evaluator"), np.random.default_rng(8)
     tokens, mask = rng.normal(size=(2, 5, 12)).astype(np.float32), np.arange(5) < np.array([[5], [3]])
-    wanted = judge.network().embed_text(*map(jnp.asarray, (tokens[..., :9], mask, tokens[..., 9:])))
+    wanted = Compiled(judge.network()).embed_text(tokens[..., :9], mask, tokens[..., 9:])
     close(judge.embed_texts(TextEmbeddings(tokens, mask, None)), wanted)
 
 
