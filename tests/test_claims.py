@@ -1,5 +1,6 @@
 """The claims ledger: every rule on made-up records, accepted verdicts, whose records decide."""
 
+import functools
 from itertools import product
 
 import numpy as np
@@ -97,6 +98,21 @@ def keep(root, tables, *, dataset="bandai", profile="laptop", **changes):
         path = root / dataset / profile / "records" / f"{name}.csv"
         write_table(path, pd.DataFrame(rows), record | changes)
     return root
+
+
+@pytest.fixture(scope="module", autouse=True)
+def the_papers_tables_are_judged_once():
+    """They say the same of a claim in every test; what is computed changes from test to test."""
+    judge_by = claims.Claim.judge
+    of_paper = functools.cache(lambda paper, name: judge_by(claims.load_claims(paper)[name], paper_evidence(paper)))
+
+    def judged(claim, evidence):
+        is_known = evidence is paper_evidence(claim.paper) and not claim.computed
+        return of_paper(claim.paper, claim.id) if is_known else judge_by(claim, evidence)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(claims.Claim, "judge", judged)
+        yield
 
 
 def judge(root, *claim_ids, datasets=("bandai", "synthetic"), profiles=("gpu", "laptop")):
