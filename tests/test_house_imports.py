@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import graphlib
 import json
 import re
@@ -41,10 +42,13 @@ def modules() -> dict[str, Path]:
     return {name.removesuffix(".__init__"): path for name, path in named.items()}
 
 
+parsed = functools.cache(ast.parse)
+
+
 def imported(source: str) -> set[str]:
     """Names of modules that a source imports, anywhere in it; of `from a import b` both a and a.b."""
     found = set()
-    for node in ast.walk(ast.parse(source)):
+    for node in ast.walk(parsed(source)):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
@@ -121,7 +125,7 @@ def test_all_that_is_imported_of_ours_is_there():
     sources = texts | {path.stem: code_of(path) for path in (ROOT / "notebooks").rglob("*.ipynb")}
     wrong = []
     for name, source in sources.items():
-        for node in ast.walk(ast.parse(source)):
+        for node in ast.walk(parsed(source)):
             if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in HOUSES:
                 there = lambda word, of=node.module: f"{of}.{word}" in texts or re.search(rf"\b{word}\b", texts[of])
                 found = node.module in texts and all(there(alias.name) for alias in node.names)
