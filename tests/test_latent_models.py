@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiled import Compiled
 from test_text_judge import OneVectorAWord
 
 from f3amd_companion import __main__ as command_line
@@ -224,7 +225,7 @@ def test_what_an_earlier_version_began_goes_on_by_the_facing_that_it_knows(data,
         assert np.array_equal(tasks[1].clips.frames, earlier.clips.frames)
     assert not load_text_model(files.model).autoencoder.released_facing
     vectors = earlier.statistics.normalise(data.select([0]).redundant_vectors(released=False))
-    coder = network_with(earlier.model_config, load_text_model(files.model).autoencoder_params)
+    coder = Compiled(network_with(earlier.model_config, load_text_model(files.model).autoencoder_params))
     seen = coder.encode(np.pad(vectors, ((0, 56), (0, 0)))[None], np.arange(96)[None] < 40)[0]
     np.testing.assert_allclose(teacher.clips.mean[0], seen[0], atol=1e-4)
 

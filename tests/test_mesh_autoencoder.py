@@ -8,6 +8,7 @@ import numpy as np
 import optax
 import pytest
 from builders import SKELETON, wandering_motion
+from compiled import Compiled
 from flax import nnx
 
 from f3amd_lib.networks import presets
@@ -18,7 +19,7 @@ SIZES = {"coarse_levels": (24, 8), "channels": (6, 8), "latent_channels": 5, "nu
          "around": (5, 4), "down": (16, 8), "up": (3, 2)}  # fmt: skip
 CONFIG = MeshAutoencoderConfig(num_vertices=42 * 6, **SIZES)
 MESH = BodyMesh.of(SKELETON, CONFIG.levels, **CONFIG.neighbours)
-VERTICES = jnp.asarray(MESH.vertices(wandering_motion(8).positions), jnp.float32)
+VERTICES = MESH.vertices(wandering_motion(8).positions).astype(np.float32)
 GENERATOR = np.random.default_rng(0)
 
 
@@ -46,7 +47,7 @@ def test_a_convolution_is_the_sum_over_edges():
     for i in range(4):
         for j in range(3):
             wanted[i] += x[neighbours[i, j]] @ sum(own[i, k, j] * bases[k] for k in range(2))
-    np.testing.assert_allclose(layer(jnp.asarray(x), neighbours), wanted, atol=1e-5)
+    np.testing.assert_allclose(Compiled(layer)(x, neighbours), wanted, atol=1e-5)
 
 
 def test_pooling_is_a_mean_by_the_sizes_of_its_weights():
@@ -63,25 +64,28 @@ def test_pooling_is_a_mean_by_the_sizes_of_its_weights():
 def test_elu_follows_convolutions_alone_and_not_the_decoders_last(linear):
     """Against numpy; in files of earlier versions it follows poolings, too, but the encoder's last."""
     network = MeshAutoencoder(dataclasses.replace(CONFIG, linear_pooling=linear), rngs=nnx.Rngs(0))
+    encode, decode = (jax.jit(lambda x, way=way: way(x, MESH.lists)) for way in (network.encode, network.decode))
     elu = lambda x: np.where(x > 0, x, np.expm1(np.minimum(x, 0.0)))
 
     def convolved(layer, x, near):
         bases = np.asarray(layer.bases[...]).reshape(CONFIG.num_bases, x.shape[1], -1)
-        return np.einsum("vbk,vkc,bcd->vd", layer.coefficients[...], x[near], bases) + np.asarray(layer.bias[...])
+        return np.einsum("vbk,vkc,bcd->vd", np.asarray(layer.coefficients[...]), x[near], bases) + np.asarray(
+            layer.bias[...]
+        )
 
     def pooled(layer, x, near):
-        weights = np.abs(layer.weights[...])
+        weights = np.abs(np.asarray(layer.weights[...]))
         x = np.einsum("vk,vkc->vc", weights / weights.sum(axis=1, keepdims=True), x[near])
         return x if layer.linear is None else x @ np.asarray(layer.linear.kernel[...])
 
     mean = lambda x: x if linear else elu(x)
     lists, (c1, p1, c2, p2), (u2, d2, u1, d1) = MESH.lists, network.encoder, network.decoder
     (a1, a2), (down1, down2), (up1, up2) = (list(map(np.asarray, few)) for few in (lists.around, lists.down, lists.up))
-    x = mean(pooled(p1, elu(convolved(c1, np.asarray(VERTICES[0]), a1)), down1))
+    x = mean(pooled(p1, elu(convolved(c1, VERTICES[0], a1)), down1))
     latent = pooled(p2, elu(convolved(c2, x, a2)), down2)
-    np.testing.assert_allclose(network.encode(VERTICES[:1], lists)[0], latent, atol=1e-5)
+    np.testing.assert_allclose(encode(VERTICES[:1])[0], latent, atol=1e-5)
     x = mean(pooled(u1, elu(convolved(d2, mean(pooled(u2, latent, up2)), a2)), up1))
-    np.testing.assert_allclose(network.decode(latent[None], lists)[0], convolved(d1, x, a1), atol=1e-5)
+    np.testing.assert_allclose(decode(latent[None])[0], convolved(d1, x, a1), atol=1e-5)
 
 
 def test_a_mesh_goes_to_its_latent_and_back_and_every_parameter_learns():

@@ -25,7 +25,7 @@ from f3amd_lib.text.networks.motionpcm import (
     waves,
 )
 
-SMALL = {"window": 4, "channels": 3, "latent_width": 16, "depth": 3, "num_heads": 2, "hidden_width": 32}
+SMALL = {"window": 4, "channels": 3, "latent_width": 16, "depth": 1, "num_heads": 2, "hidden_width": 32}
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +45,12 @@ def coders():
 
 def normal(seed, *shape):
     return draw(*shape, seed=seed)
+
+
+def one_more(array, *place):
+    copy = np.array(array)
+    copy[place] += 1.0
+    return copy
 
 
 def numbers(module):
@@ -89,7 +95,7 @@ def test_a_latent_has_one_size_and_padding_changes_nothing(coders, path):
     spoilt = jnp.where(mask[..., None], clip, 1e3)
     np.testing.assert_allclose(coder.encode(spoilt, mask)[0], mean, atol=1e-5)
     np.testing.assert_allclose(coder.encode(clip[1:, :8], mask[1:, :8])[0], mean[1:], atol=1e-5)
-    assert np.abs(coder.encode(clip.at[1, 7].add(1.0), mask)[0] - mean)[1].max() > 1e-4
+    assert np.abs(coder.encode(one_more(clip, 1, 7), mask)[0] - mean)[1].max() > 1e-4
     made = coder.decode(mean, mask)
     assert made.shape == clip.shape and not made[1, 8:].any() and made[1, :8].all()
     np.testing.assert_allclose(coder.decode(mean[1:], mask[1:, :8]), made[1:, :8], atol=1e-5)
@@ -112,9 +118,9 @@ def test_with_spans_each_token_begins_with_its_own_frames(coders):
     clip, mask, began = normal(0, 1, 12, 7), jnp.ones((1, 12), bool), {}
     for path, coder in coders.items():
         mean, log_variance = coder.encode(clip, mask)
-        heard = np.abs(coder.encode(clip.at[0, 0].add(1.0), mask)[0] - mean)[0].max(axis=-1)
+        heard = np.abs(coder.encode(one_more(clip, 0, 0), mask)[0] - mean)[0].max(axis=-1)
         made = coder.decode(mean, mask)
-        moved = np.abs(coder.decode(mean.at[0, 0].add(1.0), mask) - made)[0].max(axis=-1)
+        moved = np.abs(coder.decode(one_more(mean, 0, 0), mask) - made)[0].max(axis=-1)
         began[path] = heard, moved, np.exp(0.5 * log_variance).mean()
     heard, moved, noise = began["spans"]
     assert heard[0] > 1e-2 and not heard[1:].any() and (moved[:4] > 1e-2).all() and not moved[5:].any() and noise < 0.2
@@ -186,7 +192,9 @@ def test_each_input_moves_the_answer(teacher, change):
 # ------------------------------------------------------------------------------------------------------- discriminator
 
 
-def test_a_discriminator_reads_every_block_and_lets_the_gradient_through(teacher):
+def test_a_discriminator_reads_every_block_and_lets_the_gradient_through():
+    config = LatentDenoiserConfig(**{**SMALL, "depth": 3}, text_width=5, time_features=12)
+    teacher = Compiled(LatentDenoiser(config, rngs=nnx.Rngs(0)))
     critic = Compiled(Discriminator(DiscriminatorConfig(latent_width=16, depth=3, heads=2), rngs=nnx.Rngs(4)))
     context = teacher.encode(normal(2, 2, 5))
     scores = lambda state: critic(teacher.features(state, jnp.asarray([199, 499]), context))
