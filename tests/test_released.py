@@ -454,11 +454,11 @@ def test_motionlcm_computes_what_the_released_networks_do(family, folder):
     )
     x = np.stack([*torch.linear("denoiser.latent_pre", latent), told, torch.linear("denoiser.emb_proj.1", text)])
     x = torch.skip("denoiser.encoder", x + place("denoiser.query_pos", 5))
-    network = Compiled(model.network())
+    network = model.network()  # nine blocks alike: one by one they are compiled once
     options = {"guidance": guidance} if family == "motionlcm-student" else {}
     found = network(single(latent), np.array([time]), network.encode(single(text)), **options)
     close(found[0], torch.linear("denoiser.latent_post", x[:3]))
-    coder = Compiled(network_with(model.autoencoder, model.autoencoder_params))
+    coder = network_with(model.autoencoder, model.autoencoder_params)
     mask = np.ones((1, 6), bool)
     x = np.concatenate([torch.arrays["vae.global_motion_token"], torch.linear("vae.skel_embedding", frames)])
     x = torch.skip("vae.encoder", x + place("vae.query_pos_encoder", 12))
