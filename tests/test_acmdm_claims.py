@@ -11,13 +11,13 @@ from f3amd_companion.ledger.judgements import FAILS, HOLDS, OPEN, REMARK, UNJUDG
 from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.papers.printed import check_model
 
-S, PAPER, ENOUGH = "ACMDM-S-PS22", "acmdm", 1e7
+S, PAPER = "ACMDM-S-PS22", "acmdm"
 OTHERS = ("MARDM-v", "MARDM-eps", "MLD++", "MotionLCM V2", "ReMoDiffuse", "MotionDiffuse", "MDM-50Step")
 JOINTS = ("pelvis", "left foot", "right foot", "head", "left wrist", "right wrist")
 BOTH = ("text_FID", "R_precision_3")
 
 
-def rows(badness, *metrics, trained=None, windows=ENOUGH, **shared):
+def rows(badness, *metrics, trained=None, windows=500_000, **shared):
     """Rows of a table of text to motion by model; where a high figure is good it is the inverse of the badness."""
     table = []
     for (model, bad), metric in product(badness.items(), metrics or BOTH):
@@ -56,6 +56,7 @@ def world(true=True):
     three += rows({S: 1}, seconds, **everywhere, joint="average")
     three += rows({S: 11 if true else 1}, seconds, error, **search)
     three += rows({S: 0.003 if true else 3.0}, missed, **search)
+    three += rows({S: 1}, "held_out_loss", "acceleration_ratio", **search)
     three += rows(order(S, "OmniControl", "MotionLCM V2+CtrlNet", "MDM"), section="upper-body edit", joint="")
     ahead, true_first = (1.05, 0.5) if true else (9.0, 20.0)
     forms = {f"ACMDM-S-PS2-{form}": bad for form, bad in (("prefix", ahead), ("noisy-condition", ahead), ("masked", 1))}
@@ -94,17 +95,22 @@ def test_each_rule_needs_intervals_that_lie_apart(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("changes", "reason"),
-    [
-        ({"trained": f"{S}-raw-n3"}, "a smaller network of ours in its place"),
-        ({"windows": 192_000}, "trained 1.6 % of the paper's motions"),
-    ],
+    ("changes", "verdict"), [({}, HOLDS), ({"trained": f"{S}-raw-n3"}, HOLDS), ({"seed": 0, "length": 1.0}, UNJUDGED)]
 )
-def test_small_or_brief_networks_decide_nothing(tmp_path, changes, reason):
-    table = rows({f"{S}-raw": 1, f"{S}-raw-eps": 2, f"{S}-raw-x0": 3}, **changes)
+def test_small_networks_are_judged_at_their_scale_and_one_training_is_not(tmp_path, changes, verdict):
+    table = rows({f"{S}-raw": 1, f"{S}-raw-eps": 2, f"{S}-raw-x0": 3}, parameters=2_200_000, **changes)
     judgement = judged(tmp_path, {"text_table1": table})["R1"]
-    assert judgement.verdict == UNJUDGED
-    assert all(reason in s.reasons and s.figure for s in judgement.ours)
+    assert judgement.verdict == verdict and all(s.figure for s in judgement.ours)
+    assert all(("seen once" in s.reasons) == (verdict == UNJUDGED) for s in judgement.ours)
+    assert claims.scale([judgement]) == "here: bandai, 2.2 M parameters, 0.5 M motions"
+
+
+@pytest.mark.parametrize("what", ["held_out_loss", "acceleration_ratio"])
+def test_a_figure_by_itself_needs_motion_that_could_be_real_and_an_end(tmp_path, what):
+    """C3's second statement is a share of points that are missed, where all others compare networks."""
+    tables = world()
+    tables["text_table3"] = [row for row in tables["text_table3"] if row["metric"] != what]
+    assert judged(tmp_path, tables)["C3"].ours[1].verdict == UNJUDGED
 
 
 def test_all_models_of_the_file_are_presets_or_named_as_others():

@@ -19,6 +19,7 @@ from f3amd_companion.ledger.evidence import (
     recorded_evidence,
     snapshot_evidence,
 )
+from f3amd_companion.ledger.gate import converged
 from f3amd_companion.ledger.judgements import (
     FAILS,
     HOLDS,
@@ -42,7 +43,7 @@ from f3amd_companion.speed.timing import median_interval
 from f3amd_lib.ground.records import read_table, write_table
 from f3amd_lib.networks.attention import TransformerBlock
 from f3amd_lib.networks.spectral import FNOBlock
-from f3amd_lib.papers.printed import NINE_METRICS, REFERENCE_ROWS, checked_table
+from f3amd_lib.papers.printed import NINE_METRICS, OF_TEXT, REFERENCE_ROWS, checked_table
 
 # --------------------------------------------------------------------------------- made-up records
 
@@ -68,13 +69,12 @@ def about(value, share=0.01):
     return {"value": value, "low": value * (1 - share), "high": value * (1 + share)}
 
 
-def trained(models, *, windows=2e8, fall=0.01, **walk):
-    """Tables that let networks, (model, window), pass the gate, or not."""
-    figures = {"windows": windows, "held_out_fall": fall}.items()
+def trained(models, *, windows=2e8, **walk):
+    """Tables that say what networks, (model, window), saw, and that they walk, or not."""
     walkers = [("real", window, 0, WALKS) for window in dict.fromkeys(window for _, window in models)]
     walkers += [(*model, 8, WALKS | walk) for model in models]
     return {
-        "trained": table("model window_frames metric value", ((*model, *one) for model in models for one in figures)),
+        "trained": table("model window_frames metric value", ((*model, "windows", windows) for model in models)),
         "walking": [
             {"model": model, "window_frames": window, "steps": steps, "seed": seed, "style": "walk"} | figures
             for model, window, steps, figures in walkers
@@ -83,8 +83,15 @@ def trained(models, *, windows=2e8, fall=0.01, **walk):
     }
 
 
+def lengths(rows, seeds=3, of=(0.5, 1.0, 2.0)):
+    """Rows of so many trainings that have settled and converged, unless they say of which they are."""
+    over = [{"seed": seed, "length": length} for seed in range(seeds) for length in of]
+    return [one | row for row in rows for one in (over if "seed" not in row else [{}])]
+
+
 def keep(root, tables, *, dataset="bandai", profile="laptop", **changes):
     """Write tables (name -> rows) as records of a run, of networks that pass the gate unless they have rows of it."""
+    of_networks = [name for name in tables if name in (*OF_TRAINED_NETWORKS, *OF_TEXT)]
     networks = {
         (row["model"], row.get("window_frames", 32)): None
         for name in OF_TRAINED_NETWORKS
@@ -95,6 +102,7 @@ def keep(root, tables, *, dataset="bandai", profile="laptop", **changes):
     record = {"dataset": dataset, "profile": profile, "seed": 0, "cores": 2}
     record |= {"device_platform": "gpu", "device_kind": "Test GPU"}
     for name, rows in tables.items():
+        rows = lengths(rows) if name in of_networks else rows
         path = root / dataset / profile / "records" / f"{name}.csv"
         write_table(path, pd.DataFrame(rows), record | changes)
     return root
@@ -426,7 +434,7 @@ ONE_OF_MANY = [
     ("Q9", {"quality": sum(map(apart, MODES), quality(FNO) + quality(f"{FNO}-m1", harm=0.5, EMD=40.0))}),
     ("Q10", {"quality": sum(map(apart, OTHER_FNO), quality(FNO))}),
     ("Q11", {"quality": sum(map(apart, KINDS), quality(FNO))}),
-    ("Q16", {"quality_by_round": rounds(-0.2, gap_m=0.8)}),
+    ("Q16", {"quality_by_round": rounds(-0.2, gap_m=0.8), "quality": quality(FNO)}),
     ("E4", {"synthesis_time": small_against_many(3.0, 2.0, lambda count: 100.0 / (2.5 if count == 1 else 1.5))}),
     ("E14", {"synthesis_time": two_kinds(5.0, lambda count: 5.0 if count == 1 else 8.0)}),
 ]
@@ -563,32 +571,58 @@ def test_a_statement_on_many_figures_goes_by_the_majority(figures, verdict):
 # --------------------------------------------------------------------------------------------- the gate
 
 PAIR = [(FNO, 32), (f"{FNO}-no-IRD", 32)]
-POOR = {"quality": quality(FNO) + quality("CAMDM-96", style_coverage=14.0, EMD=40.0)}
+HALF, ONCE = (lengths(rows["quality"], of=(length,)) for rows, length in ((WRONG, 0.5), (SOUND, 1.0)))
 
 
 @pytest.mark.parametrize(
-    ("gate", "reason"),
+    ("tables", "reason"),
     [
-        (trained(PAIR, windows=192_000), "trained 0.096 % of the paper's windows"),
-        (trained(PAIR, fall=0.2), "held-out loss was still falling"),
-        (trained(PAIR, slide_speed=80.0), "does not walk"),
-        (trained(PAIR) | {"trained": trained(PAIR[:1])["trained"]}, "no record of training"),
-        (trained(PAIR) | {"walking": trained(PAIR[:1])["walking"]}, "no record of walking"),
+        ({"quality": lengths(SOUND["quality"], 1)}, "seen once"),
+        ({"quality": lengths(SOUND["quality"], 2)}, "2 seeds of 3"),
+        ({"quality": ONCE}, "not seen at half its length"),
+        ({"quality": HALF + ONCE}, "not settled: does not hold at half its length"),
+        ({"trained": trained(PAIR[:1])["trained"]}, "no record of training"),
+        ({"trained": trained(PAIR[:1])["trained"] + trained(PAIR[1:], windows=1e8)["trained"]}, "longer or shorter"),
     ],
 )
-def test_a_network_that_fails_the_gate_decides_nothing(tmp_path, gate, reason):
-    judgement = judge(keep(tmp_path, SOUND | gate), "Q13")
+def test_a_comparison_at_unlike_terms_or_seen_too_little_decides_nothing(tmp_path, tables, reason):
+    judgement = judge(keep(tmp_path, SOUND | tables), "Q13")
     assert judgement.verdict == UNJUDGED and reason in claims.statement_table(judgement).loc[0, "ours"]
+    assert judge(keep(tmp_path / "sound", SOUND), "Q13").verdict == HOLDS
 
 
-def test_the_gate_asks_what_a_claim_needs(tmp_path):
-    """A network that the claim calls poor need not walk; times and a paper's own tables need no training."""
-    models = [(FNO, 32), ("CAMDM-96", 32)]
-    poor = trained(models)["walking"]
-    poor = [row | {"slide_speed": 90.0} if row["model"] == "CAMDM-96" else row for row in poor]
-    assert judge(keep(tmp_path, POOR | {"walking": poor}), "Q12").verdict == HOLDS
-    short = trained(models, windows=192_000)
-    assert judge(keep(tmp_path / "short", POOR | short), "Q12").verdict == UNJUDGED
+def test_a_difference_within_the_spread_of_seeds_is_none(tmp_path):
+    """Each training is sure of its figure, and another one has another."""
+    rows = lengths(SOUND["quality"])
+    apart = [row | about(row["value"] * (1 + 0.9 * row["seed"] * (row["model"] == FNO))) for row in rows]
+    assert judge(keep(tmp_path, {"quality": apart}), "Q13").verdict == OPEN
+
+
+@pytest.mark.parametrize(
+    ("change", "verdict"),
+    [
+        ({}, HOLDS),
+        (trained([(FNO, 32)], slide_speed=80.0), UNJUDGED),
+        ({"recipe_errors": lengths([{"model": FNO, "recipe": "paper", "value": 2.0}], of=(2.0,))}, UNJUDGED),
+    ],
+)
+def test_a_figure_by_itself_is_judged_where_it_converged_and_the_motion_is_plausible(tmp_path, change, verdict):
+    once = [{"model": FNO, "recipe": "paper", "value": 1.0}]
+    errors = lengths(once, of=(1.0,)) + change.get("recipe_errors", lengths(once, of=(2.0,)))
+    spectrum = [row for row in world(True)["foot_spectrum"] if row["model"] == FNO]
+    root = keep(tmp_path, {"foot_spectrum": spectrum} | change | {"recipe_errors": errors})
+    assert judge(root, "Q15").ours[0].verdict == verdict
+
+
+def test_converged_means_that_twice_the_length_changes_little():
+    once = {"held_out_loss": 1.0, "text_FID": 20.0}
+    assert converged(once, {"held_out_loss": 0.96, "text_FID": 20.9})
+    for twice in ({"held_out_loss": 0.96, "text_FID": 15.0}, {"held_out_loss": 0.96}, {}):
+        assert not converged(once, twice)
+    assert not converged({}, {})
+
+
+def test_times_and_a_papers_own_tables_need_no_training(tmp_path):
     assert claims.load_claims()["Q12"].judge(paper_evidence())[0].verdict == HOLDS
     assert judge(keep(tmp_path / "time", {"synthesis_time": TIMES["E2"][0]}), "E2").verdict == HOLDS
 
@@ -681,7 +715,7 @@ def test_the_interval_of_a_median_is_not_the_spread_of_its_rounds():
 def test_real_motion_decides_before_synthetic_where_it_can(tmp_path):
     keep(tmp_path, SOUND, dataset="synthetic")
     assert judge(tmp_path, "Q13").verdict == HOLDS
-    keep(tmp_path, WRONG | trained(PAIR, windows=192_000), dataset="bandai")
+    keep(tmp_path, {"quality": lengths(WRONG["quality"], 1)}, dataset="bandai")
     assert judge(tmp_path, "Q13").dataset == "synthetic"  # the other has figures alone
     keep(tmp_path, WRONG, dataset="bandai")
     assert judge(tmp_path, "Q13").verdict == FAILS

@@ -27,8 +27,15 @@ import tyro
 
 from f3amd_companion.ledger import judgements as judging
 from f3amd_companion.ledger import theory
-from f3amd_companion.ledger.evidence import Evidence, NotMeasured, paper_evidence, recorded_evidence, snapshot_evidence
-from f3amd_companion.ledger.gate import LEAST_SHARE, why_not_judged
+from f3amd_companion.ledger.evidence import (
+    Evidence,
+    Network,
+    NotMeasured,
+    paper_evidence,
+    recorded_evidence,
+    snapshot_evidence,
+)
+from f3amd_companion.ledger.gate import why_not_judged
 from f3amd_lib.ground.files import read_toml, write_whole
 from f3amd_lib.ground.papers import check_entry, find_entry, has_paper_file, load_paper_file, paper_folders
 from f3amd_lib.ground.profiles import load_profile, repository_root
@@ -69,6 +76,7 @@ class Statement:
       figure: what was found, or why nothing was.
       reasons: why no verdict is drawn from it -> the models of which that is true.
       sources: tables that it rests on, `evidence.Source`.
+      networks: trained ones that it looked up.
       known: how much evidence knows of it: 3 for a verdict, 2 for figures without one, less for a gap (`NotMeasured`).
     """
 
@@ -80,19 +88,21 @@ class Statement:
     figure: str = ""
     reasons: Mapping[str, Sequence[str]] = field(default_factory=dict)
     sources: tuple = ()
+    networks: tuple[Network, ...] = ()
     known: int = 0
 
-    def judge(self, evidence: Evidence, paper_windows: Mapping[str, int], poor) -> Statement:
-        """Return the statement as this evidence has it; for the rest see `gate.why_not_judged`."""
+    def judge(self, evidence: Evidence) -> Statement:
+        """Return the statement as this evidence has it, without a verdict where that were unsound (`ledger.gate`)."""
         evidence.forget()
         try:
             verdict, figure = self.rule(evidence)
         except NotMeasured as gap:
             return replace(self, verdict=judging.UNMEASURED, figure=str(gap), known=gap.known)
-        reasons = {} if self.remark else why_not_judged(evidence, paper_windows, poor)
+        networks = tuple(dict.fromkeys(evidence.networks))
+        reasons = {} if self.remark else why_not_judged(evidence, self.rule, verdict, networks)
         verdict = judging.REMARK if self.remark else judging.UNJUDGED if reasons else verdict
-        known, sources = 2 if reasons else 3, tuple(dict.fromkeys(evidence.sources))
-        return replace(self, verdict=verdict, figure=figure, reasons=reasons, sources=sources, known=known)
+        found = {"reasons": reasons, "networks": networks, "known": 2 if reasons else 3}
+        return replace(self, verdict=verdict, figure=figure, sources=tuple(dict.fromkeys(evidence.sources)), **found)
 
 
 @dataclass(frozen=True)
@@ -109,7 +119,6 @@ class Claim:
       statements: what it stands for, not judged yet.
       paper_says: the paper's figure, if it names one.
       computed: the library decides it by computing, without records.
-      poor: networks that it says do badly, as rows of a table; they need not walk to be judged.
     """
 
     paper: str
@@ -121,13 +130,10 @@ class Claim:
     statements: tuple[Statement, ...]
     paper_says: str = ""
     computed: bool = False
-    poor: Sequence[Mapping] = ()
 
     def judge(self, evidence: Evidence) -> list[Statement]:
         """Return its statements as this evidence has them."""
-        windows = load_paper_file("paper", self.paper).get("training", {}).get("windows", {})
-        poor = [(one["model"], one["window_frames"]) for one in self.poor]
-        return [statement.judge(evidence, windows, poor) for statement in self.statements]
+        return [statement.judge(evidence) for statement in self.statements]
 
 
 # ------------------------------------------------------------------------------------- the paper's file
@@ -188,12 +194,11 @@ def read_claims(about: Mapping, paper: str, where: str) -> dict[str, Claim]:
     claims: dict[str, Claim] = {}
     for entry in about["claim"]:
         here = f"{where}, claim {entry.get('id')}"
-        check_entry(entry, here, ("id", "text", "where", "decided_by", "statement"), ("paper_says", "computed", "poor"))
+        check_entry(entry, here, ("id", "text", "where", "decided_by", "statement"), ("paper_says", "computed"))
         if entry["id"] in claims or entry["id"][0] not in about["groups"]:
             raise ValueError(f"{here}: needs an id of its own that begins with one of {', '.join(about['groups'])}")
         fields = {key: value for key, value in entry.items() if key != "statement"}
         fields["statements"] = tuple(_read_statement(statement, about, here) for statement in entry["statement"])
-        fields["poor"] = _read_models(entry.get("poor", []), {}, here)
         claims[entry["id"]] = Claim(paper, about["groups"][entry["id"][0]], **fields)
     return claims
 
@@ -348,6 +353,17 @@ def ledger(judgements: Sequence[Judgement]) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
+def scale(judgements: Sequence[Judgement]) -> str:
+    """Return the heading of verdicts of ours: on what data, by networks of what size, after how much training."""
+    data = dict.fromkeys(each.dataset for each in judgements if each.dataset not in ("", "computed"))
+    networks = [one for each in judgements for statement in each.ours for one in statement.networks]
+    ends = lambda values: " to ".join(dict.fromkeys(f"{end(values) / 1e6:.3g}" for end in (min, max)))
+    span = lambda values, what: f"{ends(values)} M {what}" if values else ""
+    sizes = span([one.parameters for one in networks if one.parameters > 0], "parameters")
+    seen = span([one.windows for one in networks if one.windows], "motions")
+    return "here: " + ", ".join(filter(None, [*data, sizes, seen]))
+
+
 def _found(statement: Statement) -> str:
     """Return in one text what was found of a statement, its verdict, and why it has none."""
     if statement.verdict == judging.UNMEASURED:
@@ -379,20 +395,20 @@ def ledger_markdown(judgements: Sequence[Judgement]) -> str:
     seen = gpu.train_steps * gpu.batch_size
     share = 100.0 * seen / training["windows"].get("32", np.nan)
     fields = {"steps": gpu.train_steps, "batch": gpu.batch_size, "seen": seen / 1e6, "share": share}
-    fields |= {"least": 100.0 * LEAST_SHARE, "windows": training["says"]}
+    fields |= {"windows": training["says"], "here": (here := scale(judgements))}
     head = texts["head"].format(
         count=len(load_claims(paper)), name=about["name"], setting=about["setting"], paper=paper,
         marks=", ".join(f"{mark} {verdict}" for verdict, mark in _MARKS.items() if verdict),
-        **{key: text.strip().format(**fields) for key, text in words.items()},
+        here=here, **{key: text.strip().format(**fields) for key, text in words.items()},
     )  # fmt: skip
-    counts = {"ours": frame["verdict"].value_counts(), "the paper's tables": frame["paper_verdict"].value_counts()}
+    counts = {here: frame["verdict"].value_counts(), "the paper's tables": frame["paper_verdict"].value_counts()}
     counted = pd.DataFrame(counts, index=pd.Index(judging.VERDICTS, name="verdict")).fillna(0).astype(int)
     parts = [head, markdown_table(counted.reset_index())]
-    frame["ours"] = frame["verdict"] + ": " + frame["ours"]
+    frame[here] = frame["verdict"] + ": " + frame["ours"]
     printed = frame["paper_verdict"] + ": " + frame["paper_figure"]
     frame["the paper's tables"] = printed.where(frame["paper_verdict"] != judging.UNMEASURED, "no figures")
     frame = frame.rename(columns={"id": "", "paper_says": "paper says", "dataset": "data set"})
-    short = frame[["", "claim", "where", "ours", "paper says", "the paper's tables", "data set", "hardware", "record"]]
+    short = frame[["", "claim", "where", here, "paper says", "the paper's tables", "data set", "hardware", "record"]]
     parts += [f"## {group}\n\n{compact_table(rows)}" for group, rows in short.groupby(frame["group"], sort=False)]
     parts.append("## Statement by statement\n")
     for judgement in judgements:

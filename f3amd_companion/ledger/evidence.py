@@ -19,7 +19,7 @@ from f3amd_lib.ground.names import asked_network, check_known, counted_cores
 from f3amd_lib.ground.papers import load_paper_file, paper_folders
 from f3amd_lib.ground.profiles import DATASETS, PROFILES
 from f3amd_lib.ground.records import folder_reason, read_table
-from f3amd_lib.measures.distributions import intervals_over_repeats
+from f3amd_lib.measures.distributions import intervals_over_repeats, mean_and_interval
 from f3amd_lib.papers import printed
 
 
@@ -118,7 +118,10 @@ def power_law(x: Sequence[float], figures: Sequence[Figure]) -> Figure:
 
 
 OF_TRAINED_NETWORKS = ("quality", "quality_by_round", "foot_spectrum", "x0_by_sigma", "gradient_norm", "recipe_errors")
-"""Tables that say how well a network does: it must have passed the gate (`ledger.gate`)."""
+"""Tables that say how well a network does: what is judged by them passes the gate (`ledger.gate`)."""
+
+OF_TIME = ("sampling_seconds",)
+"""Metrics of text to motion that hang on a network's size and not on its weights."""
 
 
 class Source(NamedTuple):
@@ -129,6 +132,28 @@ class Source(NamedTuple):
     hardware: str
 
 
+class Network(NamedTuple):
+    """A trained network that a rule looked up.
+
+    Attributes:
+      model, trained: its row, and the preset that stands in for that here.
+      window: frames of a window.
+      table, row: of text to motion, the table and the columns that name the row.
+      seeds, windows, parameters: trainings, motions of each, and numbers of its weights; 0 where the table has none.
+      timed: only its seconds were asked for.
+    """
+
+    model: str
+    trained: str
+    window: int = 0
+    table: str = ""
+    row: tuple = ()
+    seeds: int = 0
+    windows: int = 0
+    parameters: int = 0
+    timed: bool = False
+
+
 class Evidence:
     """Figures of one data set and profile, or of a paper, looked up by what they are about.
 
@@ -136,12 +161,13 @@ class Evidence:
       framework: "jax", or "iree" for the paper, whose networks in JAX were compiled so.
       printed: whether these are a paper's tables.
       sources: the tables that were looked into since `forget`, in that order and as often.
-      trained: (model, window) of the trained networks whose quality was looked up since then.
-      told: of text to motion, model -> (what was trained in its place, motions it saw), since then.
+      networks: the trained networks whose figures were looked up since then.
+      at: what was seen of the same networks at another length, this share of theirs; None where nothing was.
     """
 
-    def __init__(self, load: Callable, framework: str = "jax"):
+    def __init__(self, load: Callable, framework: str = "jax", at: Callable = lambda share: None):
         """Args: `load(name)` returns (table, record, path) or raises NotMeasured."""
+        self.at = functools.cache(at)
         self.framework, self.printed = framework, framework != "jax"
         # A ledger asks for thousands of figures, of few tables and by few values of a column.
         self._read = functools.cache(functools.partial(_table_or_gap, load))
@@ -156,8 +182,7 @@ class Evidence:
     def forget(self) -> None:
         """Forget what was looked up; whoever wants to know what a rule looks up calls this first."""
         self.sources: list[Source] = []
-        self.trained: list[tuple[str, int]] = []
-        self.told: dict[str, tuple[str, int]] = {}
+        self.networks: list[Network] = []
 
     def called(self, name: str) -> str:
         """Return how a sentence about a gap begins: "quality.csv has", or "the paper prints"."""
@@ -185,10 +210,16 @@ class Evidence:
         if wanted:
             which = np.logical_and.reduce(wanted)
             table = table[which] if which.any() else table[:0]  # most of what is asked was not measured
-        if name in OF_TRAINED_NETWORKS and row.get("model", "real") not in printed.REFERENCE_ROWS and len(table):
-            self.trained.append((asked_network(row["model"]), row.get("window_frames", 32)))
-        if name in printed.OF_TEXT and not self.printed:
-            self.told |= {one.model: (one.trained, one.windows) for one in table.itertuples()}
+        trained = not self.printed and len(table) > 0
+        if trained and name in OF_TRAINED_NETWORKS and row.get("model", "real") not in printed.REFERENCE_ROWS:
+            model, seeds = asked_network(row["model"]), int(table["seeds"].min())
+            self.networks.append(Network(model, model, row.get("window_frames", 32), seeds=seeds))
+        if trained and name in printed.OF_TEXT:
+            keys, timed = [key for key in printed.SCHEMAS[name] if key != "metric"], row.get("metric") in OF_TIME
+            for one in table[table["windows"] > 0].to_dict("records"):  # real motion saw none
+                about = {"seeds": one["seeds"], "windows": one["windows"], "parameters": one.get("parameters", 0)}
+                named = tuple((key, one[key]) for key in keys)
+                self.networks.append(Network(one["model"], one["trained"], 0, name, named, **about, timed=timed))
         return table
 
     def figure(self, name: str, value: str = "value", **row) -> Figure:
@@ -247,7 +278,7 @@ def recorded_evidence(root, dataset: str, profile: str) -> Evidence:
     check_known(dataset, DATASETS, "data set")
     check_known(profile, [name for name in PROFILES if name != "smoke"], "profile")
 
-    def load(name: str):
+    def load(name: str, length: float = 1.0):
         path = Path(root) / dataset / profile / "records" / f"{name}.csv"
         # A record alone is a table that got lost; `read_table` says so.
         if not path.exists() and not path.with_suffix(".json").exists():
@@ -259,9 +290,28 @@ def recorded_evidence(root, dataset: str, profile: str) -> Evidence:
             raise NotMeasured(f"{name}.csv {reason}: measure it again")
         others = [one for paper in paper_folders() for one in load_paper_file("paper", paper).get("others", ())]
         table = printed.checked_table(name, table, str(path), others if name in printed.OF_TEXT else ())
+        if name in (*OF_TRAINED_NETWORKS, *printed.OF_TEXT):
+            if not len(table := of_seeds(table, printed.SCHEMAS[name], length)):
+                raise NotMeasured(f"{name}.csv has nothing after {length:g} of the usual length")
         return table, record, path.relative_to(root).as_posix()
 
-    return Evidence(load)
+    return Evidence(load, at=lambda share: Evidence(functools.partial(load, length=share)))
+
+
+def of_seeds(table: pd.DataFrame, keys: Sequence[str], length: float = 1.0) -> pd.DataFrame:
+    """Return a table after so much of the usual length, 0 of which has no training: means over `seeds` of each row.
+
+    An interval is that of the seeds, or of the repeats of one, where that is the wider. A table without lengths and
+    seeds has one.
+    """
+    if not {"seed", "length"} <= {*table}:
+        return table.assign(seeds=1) if length == 1.0 else table[:0]
+    found = []
+    for _, rows in table[table["length"].isin([0.0, length])].groupby(list(keys), sort=False, dropna=False):
+        over, repeats = mean_and_interval(rows["value"]), rows[["low", "high"]].mean()
+        bounds = {"low": np.fmin(over["low"], repeats["low"]), "high": np.fmax(over["high"], repeats["high"])}
+        found.append({**rows.iloc[0], "value": over["value"], **bounds, "seeds": rows["seed"].nunique()})
+    return pd.DataFrame(found, columns=[*table, "seeds"])
 
 
 def _evidence_of(tables: Mapping[str, pd.DataFrame], record: Mapping, where: str, gap: str, **framework) -> Evidence:
@@ -295,7 +345,7 @@ def snapshot_evidence(root, dataset: str, profile: str) -> list[Evidence]:
     table = table[table["recipe"] == "paper"].fillna({"unit": ""})
     place, gap = path.relative_to(root).as_posix(), "no {name}.csv of them"
 
-    found = []
+    by_length: dict[int, Evidence] = {}
     for windows, rows in reversed([*table[table["steps"] > 0].groupby("windows")]):
         trainings = rows.groupby(["model", "window_frames"])["seed"].nunique().rename("value")
         most = f"1 to {trainings.max()} trainings" if trainings.max() > 1 else "one training"
@@ -304,10 +354,12 @@ def snapshot_evidence(root, dataset: str, profile: str) -> list[Evidence]:
         tables = {"quality": intervals_over_repeats(rows, [*printed.SCHEMAS["quality"], "unit"]), "trained": seen}
         of_recipes = errors[errors["windows"] == windows]
         tables["recipe_errors"] = intervals_over_repeats(of_recipes, printed.SCHEMAS["recipe_errors"])
-        tables = {name: printed.checked_table(name, one, where) for name, one in tables.items() if len(one)}
-        found.append(_evidence_of(tables, record, where, gap))
+        tables = {name: one.rename(columns={"repeats": "seeds"}) for name, one in tables.items() if len(one)}
+        tables = {name: printed.checked_table(name, one, where) for name, one in tables.items()}
+        at = lambda share, windows=windows: by_length.get(share * windows)
+        by_length[windows] = _evidence_of(tables, record, where, gap, at=at)
     curves = printed.checked_table("quality_by_epoch", _learning_curves(table), place)
-    return [*found, _evidence_of({"quality_by_epoch": curves} if len(curves) else {}, record, place, gap)]
+    return [*by_length.values(), _evidence_of({"quality_by_epoch": curves} if len(curves) else {}, record, place, gap)]
 
 
 def _learning_curves(rows: pd.DataFrame) -> pd.DataFrame:

@@ -1,70 +1,121 @@
-"""What a network must have behind it before its quality says anything of a paper's claim.
+"""What makes a comparison of trained networks sound, however small they are.
 
-A network that was stopped after minutes, or whose feet slide, says what brief training gives, and
-nothing of the paper's. Its figures are shown, and no verdict is drawn from them. Asked are the
-length of its training, as a share of the paper's windows, whether its held-out loss was flat at the
-end, and whether it walks (`measures.walking.CHECKS`). A network that the claim itself calls poor
-need not walk. A network of text to motion must be as large as the paper's and have seen as large a
-share of its motions. All of this is ours.
+A verdict of ours is one at our scale, which heads its column. A statement is judged where its networks saw as much, and
+each has three seeds (one is "seen once"), whose spread is in the intervals; where half the length gives the same
+verdict; and, where nothing stands beside a figure, where twice the length changes little and the motion is plausible.
+All of this is ours.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 
-from f3amd_companion.ledger.evidence import Evidence, known
+import numpy as np
+
+from f3amd_companion.ledger.evidence import Evidence, Network, known
 from f3amd_lib.measures.walking import CHECKS
+from f3amd_lib.networks import presets
+from f3amd_lib.text.stages.train_stage import stage_of
 
-LEAST_SHARE = 0.05
-"""Of the paper's windows. 100 passes over Bandai, the smallest data set here, are a tenth of them."""
+LEAST_SEEDS = 3
 
-FLAT = 0.05
-"""A held-out loss that falls by less over the last quarter of training is flat."""
+LEAST_CHANGE = 0.05
+"""Figures that change by less over a training of twice the length have converged."""
+
+ERRORS = ("held_out_loss", "text_FID")
+"""Figures of a row of text to motion that must have; of other networks it is held-out error and FID."""
+
+MOST_TREMBLING = 1.5
+"""Of the acceleration of real clips that plausible motion of text has."""
 
 GATE_STEPS = 8
 """Denoising steps with which a network has to walk."""
 
 
-def _faults(evidence: Evidence, model: str, window: int, paper_windows: int | None, walks: bool) -> Iterator[str]:
-    """Yield what a network lacks, in words."""
-    own = {"model": model, "window_frames": window}
-    figure = lambda table, metric, **row: known(evidence.figure, table, **own | row, metric=metric)
-    windows, fall = figure("trained", "windows"), figure("trained", "held_out_fall")
-    if windows is None:
-        yield "no record of training"
-    elif paper_windows and windows.value < LEAST_SHARE * paper_windows:
-        yield f"trained {100.0 * windows.value / paper_windows:.2g} % of the paper's windows"
-    if windows and fall is None:
-        yield "no record of its loss towards the end"
-    elif windows and fall.value > FLAT:
-        yield "held-out loss was still falling"
-    if not walks:
-        return
-    pairs = {check: (figure("walking", check, steps=GATE_STEPS), figure("walking", check, model="real", steps=0))
+def converged(once: Mapping[str, float], twice: Mapping[str, float]) -> bool:
+    """Tell whether a training has: figures after it and after twice its length differ by less than 5 %."""
+    return bool(once) and all(
+        abs(twice.get(name, np.inf) - was) < LEAST_CHANGE * abs(was) for name, was in once.items()
+    )
+
+
+def _errors(evidence: Evidence | None, network: Network) -> dict[str, float]:
+    """Return the figures by which a network converges, those that are on record."""
+    figure = lambda table, **row: evidence and known(evidence.figure, table, **row)
+    if network.table:
+        found = {name: figure(network.table, **dict(network.row), metric=name) for name in ERRORS}
+    else:
+        walks = {"model": network.model, "window_frames": network.window, "steps": GATE_STEPS}
+        found = {"FID": figure("quality", **walks, metric="FID")}
+        found["error"] = figure("recipe_errors", model=network.model, recipe="paper")
+    return {name: one.value for name, one in found.items() if one}
+
+
+def _plausible(evidence: Evidence, network: Network) -> bool:
+    """Tell whether a network is on record as one whose motion could be real."""
+    if network.table:
+        trembling = known(evidence.figure, network.table, **dict(network.row), metric="acceleration_ratio")
+        return trembling is not None and trembling.value <= MOST_TREMBLING
+    figure = lambda check, **row: known(evidence.figure, "walking", metric=check, window_frames=network.window, **row)
+    pairs = {check: (figure(check, model=network.model, steps=GATE_STEPS), figure(check, model="real", steps=0))
              for check in CHECKS}  # fmt: skip
-    if any(None in pair for pair in pairs.values()):
-        yield "no record of walking"
-    elif not all(CHECKS[check][1](own.value, real.value) for check, (own, real) in pairs.items()):
-        yield "does not walk"
+    return all(None not in pair and CHECKS[check][1](*(one.value for one in pair)) for check, pair in pairs.items())
+
+
+def _seen(evidence: Evidence, network: Network) -> float | None:
+    """Return how much a network saw; None where that is not on record."""
+    row = {"model": network.model, "window_frames": network.window, "metric": "windows"}
+    seen = None if network.table else known(evidence.figure, "trained", **row)
+    return network.windows or (seen and seen.value)
+
+
+def _stage(network: Network) -> str:
+    """Return what has terms of its own: a teacher sees more motions than its student."""
+    return stage_of(network.trained) if network.table and network.trained in presets.PRESETS else network.table
+
+
+def _faults(evidence: Evidence, rule: Callable, verdict: str, networks: Collection[Network]) -> Iterator:
+    """Yield what a statement's networks lack, and of which of them that is true."""
+    # One figure of one network is absolute: no other stands beside it.
+    beside = {"ratio_to", "rows", "against"} & rule.keywords.keys()
+    absolute = not beside and len({(one.model, one.window, one.row) for one in networks}) == 1
+    if all(one.timed for one in networks):  # weights do not change times, sizes do
+        yield from (
+            ("a smaller network of ours in its place", one) for one in networks if absolute and one.trained != one.model
+        )
+        return
+    seen = {one: _seen(evidence, one) for one in networks}
+    for one in networks:
+        if seen[one] is None:
+            yield "no record of training", one
+        elif one.seeds < LEAST_SEEDS:
+            yield "seen once" if one.seeds == 1 else f"{one.seeds} seeds of {LEAST_SEEDS}", one
+        elif any(seen[one] != seen[two] for two in networks if _stage(one) == _stage(two)):
+            yield "trained longer or shorter than what it is compared with", one
+    half, twice = evidence.at(0.5), evidence.at(2.0)
+    if half is None or (again := known(rule, half)) is None:
+        yield from (("not seen at half its length", one) for one in networks)
+    elif again[0] != verdict:
+        yield from ((f"not settled: {again[0]} at half its length", one) for one in networks)
+    for one in networks if absolute else ():
+        if not converged(*(_errors(length, one) for length in (evidence, twice))):
+            yield "not converged: no training of twice the length agrees", one
+        if not _plausible(evidence, one):
+            yield "its motion is not plausible, or not on record", one
 
 
 def why_not_judged(
-    evidence: Evidence, paper_windows: Mapping[str, int], poor: Collection[tuple[str, int]] = ()
+    evidence: Evidence, rule: Callable, verdict: str, networks: Collection[Network]
 ) -> dict[str, list[str]]:
-    """Return why the networks that were looked up last decide nothing: reason -> models; none where they may.
+    """Return why a statement is not judged: reason -> networks; none where it may be, as of a paper's own tables.
 
     Args:
-      evidence: records, after a rule has looked into them; a paper's own tables may always be judged.
-      paper_windows: frames of a window, as text -> windows that the paper trained with.
-      poor: (model, window) of networks that the claim calls poor.
+      evidence: records.
+      rule: of the statement, from evidence to verdict and text, a partial function.
+      verdict: what it says here.
+      networks: the trained ones that it looked up.
     """
-    faults = []
-    for model, window in () if evidence.printed else dict.fromkeys(evidence.trained):
-        of_paper, walks = paper_windows.get(str(window)), (model, window) not in poor
-        faults += [(fault, model) for fault in _faults(evidence, model, window, of_paper, walks)]
-    for model, (trained, motions) in evidence.told.items():
-        if trained != model:
-            faults.append(("a smaller network of ours in its place", trained))
-        if motions < LEAST_SHARE * paper_windows.get("text", 0):
-            faults.append((f"trained {100.0 * motions / paper_windows['text']:.2g} % of the paper's motions", trained))
-    return {fault: [model for found, model in faults if found == fault] for fault, _ in faults}
+    reasons: dict[str, list[str]] = {}
+    for fault, one in _faults(evidence, rule, verdict, networks) if networks and not evidence.printed else ():
+        reasons.setdefault(fault, []).append(one.trained)
+    return reasons

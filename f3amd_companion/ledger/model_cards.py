@@ -16,7 +16,6 @@ from pathlib import Path
 import jax
 import pandas as pd
 
-from f3amd_companion.ledger.gate import LEAST_SHARE
 from f3amd_companion.ledger.quality_tables import figure_column, measured_table
 from f3amd_lib.ground.files import read_toml, write_whole
 from f3amd_lib.ground.names import counted_cores
@@ -125,7 +124,7 @@ def model_card(path: Path, quality: pd.DataFrame | None) -> str:
             figures, limits = _figures(quality[own], real), _limits(quality[own], real)
     limits.append("It knows the walks, runs and styles of its data, on level ground, and no others.")
     whole = load_paper_file("paper")["training"]["windows"].get(str(trained.config.window))
-    if whole and training["seen"] < LEAST_SHARE * whole:
+    if whole and training["seen"] < whole:
         limits.append(f"It saw {100 * training['seen'] / whole:.2g} % of the windows that the paper's models saw.")
     told = {"styles": ", ".join(trained.styles), "limits": "\n".join(f"- {limit}" for limit in limits)}
     return _filled("model_card", path, trained, trained.params, figures, **training, **told)

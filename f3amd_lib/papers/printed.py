@@ -71,7 +71,10 @@ def checked_table(name: str, table: pd.DataFrame, where: str, others: Sequence[s
     undefined = {bound: float("nan") for bound in ("low", "high") if bound not in table}  # nothing was repeated
     table = table[table["value"].notna()].assign(**undefined)
     astray = ~np.isfinite(table["value"]) | (table["low"] > table["value"]) | (table["high"] < table["value"])
-    faults = {"a figure that is infinite or outside its interval": astray, "two rows": table.duplicated(keys)}
+    faults = {
+        "a figure that is infinite or outside its interval": astray,
+        "two rows": table.duplicated([*keys, *{"seed", "length"} & {*table}]),
+    }
     if name == "quality" and "unit" in table:
         wanted = table["metric"].map({metric: unit for metric, (unit, _) in NINE_METRICS.items()})
         unlike = wanted.notna() & (table["unit"].astype(object).fillna("") != wanted)
