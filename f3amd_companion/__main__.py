@@ -56,7 +56,7 @@ with epy.lazy_imports():
     from f3amd_lib.rollout import generated, start_poses
     from f3amd_lib.rollout import rollout as rollouts
     from f3amd_lib.text import released
-    from f3amd_lib.text.data import captioned_folder, text_encoders
+    from f3amd_lib.text.data import captioned_folder, text_encoders, text_motions
     from f3amd_lib.text.judge import text_judge
     from f3amd_lib.text.sampling import captioned_motion
     from f3amd_lib.text.stages import text_models, train_stage
@@ -630,7 +630,8 @@ def bench(
 
 def measure(
     names: Positional[tuple[str, ...]] = (), *, motion: Data, model: Repeatable = (), published: Path | None = None,
-    minutes: float | None = None, captions: Encoder = Encoder(),
+    minutes: float | None = None, captions: Encoder = Encoder(), plan: Literal["", "queue"] = "",
+    packed: Path | None = None,
 ) -> int:  # fmt: skip
     """Measure what notebooks only draw; tables go to <results>/records/.
 
@@ -641,15 +642,20 @@ def measure(
       model: this preset; repeatable.
       published: CAMDM's published weights as safetensors, one more row of quality.
       minutes: of text to motion: stop then; a later call goes on, and the exit status is 3.
+      plan: of text to motion: queue trains each row to several lengths, and compared ones with several seeds (hours to
+        days); all of its tables, in its order, if none is named.
+      packed: of text to motion: all clips of bandai as their packed cache file, instead of their source.
     """
+    names = names or (papers.load_paper_file("experiments", "acmdm")["settings"][plan]["order"] if plan else ())
     for name in names:
         check_known(name, [*measuring.MEASUREMENTS, *text_tables.TEXT_MEASUREMENTS], "measurement")
     if of_text := [name for name in names if name in text_tables.TEXT_MEASUREMENTS]:
         if len(of_text) < len(names):
             raise ValueError(f"{', '.join(of_text)}: measure text to motion by a call of its own")
         profile, how = motion.numbers(), {"models": model, "stop_at": _stop_at(minutes)}
-        given = text_models.open_text_motions(motion.data, motion.source), captions.load(), profile
-        measurements = text_tables.TEXT_MEASUREMENTS
+        clips = text_motions.bandai_text_motions(packed_data.load_packed(packed)) if packed else None
+        given = clips or text_models.open_text_motions(motion.data, motion.source), captions.load(), profile
+        measurements, how = text_tables.TEXT_MEASUREMENTS, how | ({"plan": plan} if plan else {})
     else:
         models = [network_presets.find_preset(name).name for name in model] or None
         prepared, profile = motion.open()

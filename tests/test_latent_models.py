@@ -272,8 +272,8 @@ def test_a_student_is_trained_by_name_with_all_before_it(data, tmp_path, monkeyp
     assert all((a == b).all() for a, b in zip(*map(jax.tree.leaves, (alone.params, made.params)), strict=True))
     assert sorted(path.name.split(".")[0] for path in elsewhere.glob("*.safetensors")) == ["tiny-M2"] * 2
     for name, file, reason in (
-        ("tiny-VAE", "tiny-teacher", "tiny-VAE is distilled from nothing"),
-        ("tiny-M2", "tiny-VAE", "holds tiny-VAE, and tiny-M2 is distilled from tiny-teacher"),
+        ("tiny-VAE", "tiny-teacher", "tiny-VAE stands on nothing"),
+        ("tiny-M2", "tiny-VAE", "holds tiny-VAE, and tiny-M2 stands on tiny-teacher"),
     ):
         with pytest.raises(ValueError, match=reason):
             from_file(name, teacher=files[file])

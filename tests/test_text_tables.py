@@ -11,7 +11,14 @@ from builders import captioned_walks, refused
 from test_text_models import ENCODER, PROFILE, TINY
 
 from f3amd_companion.measuring import text_tables
-from f3amd_companion.measuring.text_tables import UNCONTROLLED, Bench, asked_frames, measure_text_table, obtain_judge
+from f3amd_companion.measuring.text_tables import (
+    UNCONTROLLED,
+    Bench,
+    asked_frames,
+    measure_text_table,
+    obtain_judge,
+    planned,
+)
 from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.ground.trees import weights_digest
@@ -183,3 +190,32 @@ def test_variety_is_that_of_one_captions_motions(data):
 
     assert make(0.0) == 0.0
     assert make(2.0) == pytest.approx(2 * make(1.0), rel=1e-5) and make(1.0) > 0.1
+
+
+def test_a_queue_trains_every_row_before_another_seed_and_only_compared_rows_with_several():
+    row, real, settings = {"trained": "tiny"}, {"trained": "Real"}, {"lengths": [0.5, 1.0, 2.0], "seeds": 3}
+    once = [(row, 0, 1.0), (real, 0, 1.0)]
+    first = [(row, 0, 0.5), (row, 0, 1.0), (row, 0, 2.0), (real, 0, 0.0)]
+    assert planned(once, settings, False) == first
+    assert planned(once, settings, True) == first + [(row, seed, length) for seed in (1, 2) for length in (0.5, 1.0)]
+
+
+def test_a_queue_trains_each_length_for_its_share_of_motions_on_what_it_stands_on(data, tmp_path, monkeypatch):
+    stages = load_paper_file("experiments", "acmdm")["settings"]["queue"]["stages"]
+    settings = {"most_frames": 80, "lengths": [0.5], "seeds": 1, "compared": [], "stages": stages}
+    bench, asked = types.SimpleNamespace(settings=settings, record=lambda *arguments: {"settings": settings}), []
+
+    def train(data, encoder, profile, name, *, folder, teacher=None, **how):
+        asked.append((name, profile.train_steps, folder.name, teacher and teacher.parent.name, how["learning_rate"]))
+        return None if name == "ACMDM-S-PS22-n2" else name
+
+    monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path))
+    monkeypatch.setattr(text_tables, "bench_of", lambda *arguments, **how: bench)
+    monkeypatch.setattr(text_tables, "train_stage", train)
+    rows, seed = [{"model": "ACMDM-S-PS22", "trained": "ACMDM-S-PS22-n2"}], PROFILE.seed
+    assert measure_text_table("text_table1", data, ENCODER, PROFILE, rows=rows, plan="queue", **QUIET) is None
+    steps = [stages[stage]["motions"] / stages[stage]["batch_size"] for stage in ("motion autoencoder", "ACMDM")]
+    assert asked == [
+        ("ACMDM-causal-AE-w64", steps[0], f"seed{seed}-1", None, 1e-3),
+        ("ACMDM-S-PS22-n2", round(0.5 * steps[1]), f"seed{seed}-0.5", f"seed{seed}-1", 1e-3),
+    ]

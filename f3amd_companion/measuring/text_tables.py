@@ -27,7 +27,7 @@ from f3amd_companion.measuring.runner import Records, records_folder
 from f3amd_lib.ground.names import check_known
 from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.ground.profiles import Profile, runs_dir
-from f3amd_lib.ground.records import run_record, write_table
+from f3amd_lib.ground.records import read_table, run_record, write_table
 from f3amd_lib.ground.trees import weights_digest
 from f3amd_lib.measures.distributions import intervals_over_repeats
 from f3amd_lib.motion.skeleton import Motion, Skeleton, mirror
@@ -41,7 +41,7 @@ from f3amd_lib.text.sampling import motionpcm_sampling, text_to_motion
 from f3amd_lib.text.sampling.captioned_motion import draw_motions, motion_drawer
 from f3amd_lib.text.stages import text_models
 from f3amd_lib.text.stages.text_models import CONTROL, PELVIS, LatentModel, TextModel
-from f3amd_lib.text.stages.train_stage import train_stage
+from f3amd_lib.text.stages.train_stage import STAGES, stage_of, stands_on, train_stage
 from f3amd_lib.training.checkpoints import network_with
 
 PAPERS = {
@@ -104,16 +104,18 @@ class Bench:
 
     def _seen(self, system: Callable, repeats: int) -> pd.DataFrame:
         """Return metric, value, low and high of a system as `judge_motions` knows it, foot skating among them."""
-        skating = []
+        seen, real = [], list(map(self.real.clip, range(self.real.num_clips)))
+        shaking = lambda clips: np.mean([np.linalg.norm(np.diff(clip, 2, axis=0), axis=-1).mean() for clip in clips])
 
         def watched(repeat: int):
             motions, told = system(repeat)
             shares = [text_metrics.foot_skating_ratio(self.real.skeleton, each, self.real.fps) for each in motions]
-            skating.append({"metric": "foot_skating", "value": np.mean(shares)})
+            seen.append({"metric": "foot_skating", "value": np.mean(shares)})
+            seen.append({"metric": "acceleration_ratio", "value": shaking(motions) / shaking(real)})
             return motions, told
 
         table = self.judged({"made": watched}, repeats)
-        table = pd.concat([table[table["system"] == "made"], intervals_over_repeats(pd.DataFrame(skating), ["metric"])])
+        table = pd.concat([table[table["system"] == "made"], intervals_over_repeats(pd.DataFrame(seen), ["metric"])])
         return table[["metric", "value", "low", "high"]]
 
     def judged(self, systems: dict, repeats: int) -> pd.DataFrame:
@@ -436,19 +438,22 @@ def _judged(model: TextModel | LatentModel):
     return model.params if model.branch is None else model.branch
 
 
-def bench_of(data: TextMotions, encoder: TextEncoder, profile: Profile, *, folder=None, **leg) -> Bench | None:
+def bench_of(
+    data: TextMotions, encoder: TextEncoder, profile: Profile, *, folder=None, plan: str = "", **leg
+) -> Bench | None:
     """Return what rows are measured with; the judge is trained if it is not, None where `stop_at` comes first.
 
     Args:
       data, encoder, profile: as of `measure_text_table`; the judge learns from whole clips and is asked about the first
         `most_frames` of so many held-out ones as the profile's settings say.
       folder: where the judge lies instead of `runs/`.
+      plan: settings of the file instead of the profile's, such as "queue".
       **leg: stop_at and progress, as for `optimise`.
     """
     judge = obtain_judge(data, encoder, profile, folder=folder, **leg)
     if judge is None:
         return None
-    settings = load_paper_file("experiments", "acmdm")["settings"][profile.name]
+    settings = load_paper_file("experiments", "acmdm")["settings"][plan or profile.name]
     real = judged_clips(data.cut(settings["most_frames"]))
     chosen = np.random.default_rng(profile.seed).permutation(real.num_clips)[: settings["clips"]]
     return Bench(judge, encoder, real.select(np.sort(chosen)), settings, profile.seed)
@@ -456,7 +461,7 @@ def bench_of(data: TextMotions, encoder: TextEncoder, profile: Profile, *, folde
 
 def measure_text_table(
     name: str, data: TextMotions, encoder: TextEncoder, profile: Profile, *,
-    models: Iterable[str] | None = None, folder=None, rows: Iterable[Mapping] | None = None, **leg,
+    models: Iterable[str] | None = None, folder=None, rows: Iterable[Mapping] | None = None, plan: str = "", **leg,
 ) -> Path | None:  # fmt: skip
     """Train and measure the rows of a table that it still lacks.
 
@@ -467,47 +472,62 @@ def measure_text_table(
       models: rows of these models alone, which are measured again.
       folder: where judge and weights lie instead of `runs/`.
       rows: instead of the file's.
+      plan: settings of the file instead of the profile's: of "queue" each row is trained to several lengths, and and
+        in its `compared` tables with several seeds.
       **leg: stop_at and progress, as for `optimise`.
 
     Returns:
       The table, `records/<name>.csv`; None where the time was over first.
     """
     about = load_paper_file("experiments", next(paper for paper, names in PAPERS.items() if name in names))[name]
-    asked, bench = list(models or ()), bench_of(data, encoder, profile, folder=folder, **leg)
+    asked, bench = list(models or ()), bench_of(data, encoder, profile, folder=folder, plan=plan, **leg)
     if bench is None:
         return None
     settings, record = bench.settings, bench.record(profile, data, name)
     # ACMDM's models of a table are all trained alike, and briefly, apart from those that `f3amd text` is to find.
-    apart = folder or runs_dir(profile.dataset, profile.name) / "text_tables"
+    apart = folder or runs_dir(profile.dataset, profile.name) / (f"text_{plan}" if plan else "text_tables")
     cut, most_frames = data.cut(settings["most_frames"]), settings["most_frames"]
-    brief = dataclasses.replace(profile, train_steps=settings.get("train_steps", profile.train_steps))
     rows = [dict(row) for row in (about["rows"] if rows is None else rows)]
     for model in asked:
         check_known(model, [row["model"] for row in rows], f"model of {name}")
-    keys = [column for column in rows[0] if column not in ("trained", "first")]
+    keys = [column for column in rows[0] if column not in ("trained", "first")] + ["seed", "length"] * bool(plan)
     tables = dict.fromkeys((name, *about.get("beside", ())), keys)
     records = Records(records_folder(profile), record, tables, again=asked)
 
-    def trained(preset: str) -> TextModel | LatentModel | None:
+    def trained(preset: str, seed: int = profile.seed, length: float = 1.0) -> TextModel | LatentModel | None:
         base = text_models.preset_and_branch(preset)[0]
-        if text_models.is_latent_preset(base):  # these see clips of a length of their own
+        form, latent = presets.find_preset(base), text_models.is_latent_preset(base)
+        if latent and not plan:  # these see clips of a length of their own
             return train_stage(data, encoder, profile, preset, folder=folder, **leg)
-        form = presets.find_preset(base)
         # Prefixes and blocks have lengths of their own; other windows only say how long the longest clip is.
         own = "prefix_frames" in form.training or "block_frames" in form.network
-        where = {"window": None if own else most_frames, "folder": apart, **leg}
+        where = {"window": None if own or latent else most_frames, "folder": apart, **leg}
+        if plan:
+            where |= {"folder": apart / f"seed{seed}-{length:g}", **settings["stages"][stage_of(preset)]}
+            motions, stage = where.pop("motions") * length, STAGES[stage_of(preset)]
+            share = load_paper_file("recipes", stage.settings.paper)[f"short-{stage.recipe}"].get("share", 1.0)
+            steps = max(1, round(motions / where["batch_size"] / share))
+            if below := stands_on(preset):
+                if trained(below) is None:
+                    return None
+                once = apart / f"seed{profile.seed}-1"
+                where["teacher"] = text_models.text_model_files(profile, below, folder=once).model
+            brief = dataclasses.replace(profile, train_steps=steps, seed=seed)
+            return train_stage(data if latent else cut, encoder, brief, preset, **where)
         if form.latent and "autoencoder_steps" in settings:
             steps = dataclasses.replace(profile, train_steps=settings["autoencoder_steps"])
             if train_stage(cut, encoder, steps, form.latent, **where) is None:
                 return None
+        brief = dataclasses.replace(profile, train_steps=settings.get("train_steps", profile.train_steps))
         return train_stage(cut, encoder, brief, preset, batch_size=settings.get("batch_size"), **where)
 
-    for row in rows:
+    once = [(row, profile.seed, 1.0) for row in rows]
+    for row, seed, length in planned(once, settings, name in settings["compared"]) if plan else once:
         if asked and row["model"] not in asked:
             continue
         model = first = None
         if row["trained"] != REAL:
-            model = trained(row["trained"] + BRANCHES.get(row.get("section"), ""))
+            model = trained(row["trained"] + BRANCHES.get(row.get("section"), ""), seed, length)
             if model is not None and "first" in row:
                 first = trained(row["first"])
                 model = None if first is None else model
@@ -520,13 +540,41 @@ def measure_text_table(
             told = model.record["identity"]["training"]
             steps = model.record.get("stopped_at_step", told["num_steps"])
             named |= {"windows": steps * told["batch_size"], "weights": weights_digest(_judged(model))}
+        loss = None
+        if plan:
+            size = 0 if model is None else sum(leaf.size for leaf in jax.tree.leaves(_judged(model)))
+            named |= {"seed": seed, "length": length, "parameters": size}
+            if model is not None:
+                files = text_models.text_model_files(profile, model.name, folder=apart / f"seed{seed}-{length:g}")
+                loss = {
+                    "metric": "held_out_loss",
+                    "value": read_table(files.history)[0]["held_out_loss"].dropna().iloc[-1],
+                }
 
-        def measured(row: Mapping, model=model, first=first) -> dict:
+        def measured(row: Mapping, model=model, first=first, loss=loss) -> dict:
             made = KINDS[about["kind"]](bench, model, row, about, first)
-            return made if isinstance(made, dict) else {name: made}
+            made = made if isinstance(made, dict) else {name: made}
+            if loss:
+                what = [column for column in made[name] if column not in ("metric", "value", "low", "high")]
+                places = made[name][what].drop_duplicates() if what else pd.DataFrame([{}])
+                made[name] = pd.concat([made[name], places.assign(**loss)])
+            return made
 
         records.measure([named], measured)
     return records.path(name)
+
+
+def planned(once: Iterable[tuple[Mapping, int, float]], settings: Mapping, compared: bool) -> list[tuple]:
+    """Return (row, seed, length) of all trainings of a table, in order: every row before any has another seed.
+
+    The first seed goes through all lengths, those of rows that are `compared` to what a verdict asks for. Real motion
+    has no length.
+    """
+    lengths = lambda row: [0.0] if row["trained"] == REAL else settings["lengths"]
+    others = itertools.product(range(1, settings["seeds"] if compared else 1), once, (0.5, 1.0))
+    return [(row, seed, length) for row, seed, _ in once for length in lengths(row)] + [
+        (row, seed + number, length) for number, (row, seed, _), length in others if row["trained"] != REAL
+    ]
 
 
 # --------------------------------------------------------------------------------------------------------- the probes

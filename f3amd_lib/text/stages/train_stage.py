@@ -106,7 +106,8 @@ def stage_recipe(training: type, part: str, profile: Profile, preset: str | None
 
 def train_stage(
     data: TextMotions, encoder: TextEncoder, profile: Profile, name: str, *,
-    window: int | None = None, batch_size: int | None = None, folder=None, teacher=None, **leg,
+    window: int | None = None, batch_size: int | None = None, learning_rate: float | None = None, folder=None,
+    teacher=None, **leg,
 ) -> TextModel | LatentModel | None:  # fmt: skip
     """Train a preset, and first what it stands on, unless that is finished already; of ACMDM with whatever settings.
 
@@ -120,17 +121,17 @@ def train_stage(
       name: of a preset of ACMDM, perhaps with "+control" or "+control-pelvis" behind it, or of MotionPCM.
       window: of ACMDM, most frames of motion in a state, instead of the preset's; longer clips are cut to their first
         frames, so that all begin where a caption's motion will: at the origin.
-      batch_size: instead of the recipe's.
+      batch_size, learning_rate: instead of the recipe's.
       folder: where files go instead of `runs/`.
-      teacher: file of the teacher that a student is distilled from, such as one that ships, instead of training one.
+      teacher: file of what it stands on, such as a student's teacher that ships, instead of training one.
       **leg: stop_at and progress, as for `optimise`.
 
     Returns:
       The model as its file has it; None where `stop_at` came first.
 
     Raises:
-      ValueError: if a model or a state of other settings lies there, or what it stands on knows other data, or a
-        teacher is named for what is no student.
+      ValueError: if a model or a state of other settings lies there, or what it stands on knows other data, or
+        the teacher is none of its.
       TrainingDiverged: if the loss stops being a number.
     """
     base, branch = preset_and_branch(name)
@@ -142,8 +143,8 @@ def train_stage(
     before = None
     if teacher is not None:
         before = load_text_model(teacher)
-        if stage_of(name) != "student" or before.name != earlier:
-            raise ValueError(f"{teacher}: holds {before.name}, and {name} is distilled from {earlier or 'nothing'}")
+        if before.name != earlier:
+            raise ValueError(f"{teacher}: holds {before.name}, and {name} stands on {earlier or 'nothing'}")
         if not before.record["identity"]["dataset_fingerprint"].startswith(data.fingerprint):
             raise ValueError(f"{teacher}: was trained on other clips than these; leave --teacher out to train one")
     elif earlier:
@@ -158,7 +159,8 @@ def train_stage(
             return None
         if acmdm and before.record["dataset_fingerprint"] != data.fingerprint:
             raise ValueError(f"{lies}: was trained on other data; move it away or name another folder (--out)")
-    settings, codec = {} if batch_size is None else {"batch_size": batch_size}, None
+    settings, codec = {"batch_size": batch_size, "learning_rate": learning_rate}, None
+    settings = {name: value for name, value in settings.items() if value is not None}
     if acmdm:
         codec = _codec_of_positions(data, preset) if before is None else before.codec
         settings["unit"] = max(1, UNIT // codec.frames_per_state)
