@@ -2,8 +2,6 @@
 
 import dataclasses
 
-import numpy as np
-import pandas as pd
 import pytest
 from builders import HISTORY, WINDOW, packed_from, tiny_camdm, tiny_trained, wandering_motion
 
@@ -78,21 +76,15 @@ def test_noise_use_asks_every_model_at_its_own_levels(prepared, tmp_path, monkey
 
 
 def test_how_long_a_model_was_trained_is_written_down(prepared, tmp_path, monkeypatch):
-    """Windows are steps times batch; the fall is that of the held-out loss over the last quarter."""
+    """Windows are steps times batch."""
     monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path))
     tiny = tiny_trained()
     tiny = dataclasses.replace(tiny, record=tiny.record | {"training": {"num_steps": 100, "batch_size": 16}})
-    losses = [4.0, np.nan, 2.0, 1.8, 1.5]  # watched at 20, 60, 80 and 100 of 100 steps
-    history = pd.DataFrame({"step": [20, 40, 60, 80, 100], "held_out_loss": losses})
-    histories = {"F3AMD-FNO-32": history, "F3AMD-FNO-48": history[["step"]]}
-    monkeypatch.setattr(measure, "obtain_model", lambda prepared, profile, *, preset: (tiny, histories[preset], ""))
-    monkeypatch.setattr(measure, "available_models", lambda profile: list(histories))
+    monkeypatch.setattr(measure, "obtain_model", lambda prepared, profile, *, preset: (tiny, None, ""))
+    monkeypatch.setattr(measure, "available_models", lambda profile: ["F3AMD-FNO-32", "F3AMD-FNO-48"])
     table, record = read_table(measure.measure_trained(prepared, PROFILE))
-    found = table.set_index(["model", "metric"])["value"]
-    assert found["F3AMD-FNO-32", "windows"] == 1600 and found["F3AMD-FNO-32", "held_out_fall"] == pytest.approx(
-        1.0 - 1.5 / (2.0 - 0.2 * np.log(75 / 60) / np.log(80 / 60))
-    )
-    assert np.isnan(found["F3AMD-FNO-48", "held_out_fall"]) and set(record["weights_digests"]) == set(histories)
+    assert table["metric"].eq("windows").all() and table["value"].eq(1600).all()
+    assert list(record["weights_digests"]) == ["F3AMD-FNO-32", "F3AMD-FNO-48"]
     # Of a training that was gone on with, all legs count, as on its card.
     tiny = dataclasses.replace(tiny, record=tiny.record | {"windows_seen": 5000})
     table, _ = read_table(measure.measure_trained(prepared, PROFILE, ["F3AMD-FNO-32"]))

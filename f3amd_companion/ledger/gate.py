@@ -62,13 +62,6 @@ def _plausible(evidence: Evidence, network: Network) -> bool:
     return all(None not in pair and CHECKS[check][1](*(one.value for one in pair)) for check, pair in pairs.items())
 
 
-def _seen(evidence: Evidence, network: Network) -> float | None:
-    """Return how much a network saw; None where that is not on record."""
-    row = {"model": network.model, "window_frames": network.window, "metric": "windows"}
-    seen = None if network.table else known(evidence.figure, "trained", **row)
-    return network.windows or (seen and seen.value)
-
-
 def _stage(network: Network) -> str:
     """Return what has terms of its own: a teacher sees more motions than its student."""
     return stage_of(network.trained) if network.table and network.trained in presets.PRESETS else network.table
@@ -78,13 +71,13 @@ def _faults(evidence: Evidence, rule: Callable, verdict: str, networks: Collecti
     """Yield what a statement's networks lack, and of which of them that is true."""
     # One figure of one network is absolute: no other stands beside it.
     beside = {"ratio_to", "rows", "against"} & rule.keywords.keys()
-    absolute = not beside and len({(one.model, one.window, one.row) for one in networks}) == 1
+    alone = networks if not beside and len({(one.model, one.window, one.row) for one in networks}) == 1 else ()
     if all(one.timed for one in networks):  # weights do not change times, sizes do
-        yield from (
-            ("a smaller network of ours in its place", one) for one in networks if absolute and one.trained != one.model
-        )
+        yield from (("a smaller network of ours in its place", one) for one in alone if one.trained != one.model)
         return
-    seen = {one: _seen(evidence, one) for one in networks}
+    # How much a network saw stands in the row of a table of text to motion, and in a table of its own of others.
+    row = lambda one: {"model": one.model, "window_frames": one.window, "metric": "windows"}
+    seen = {one: one.windows or known(evidence.figure, "trained", **row(one)) for one in networks}
     for one in networks:
         if seen[one] is None:
             yield "no record of training", one
@@ -97,7 +90,7 @@ def _faults(evidence: Evidence, rule: Callable, verdict: str, networks: Collecti
         yield from (("not seen at half its length", one) for one in networks)
     elif again[0] != verdict:
         yield from ((f"not settled: {again[0]} at half its length", one) for one in networks)
-    for one in networks if absolute else ():
+    for one in alone:
         if not converged(*(_errors(length, one) for length in (evidence, twice))):
             yield "not converged: no training of twice the length agrees", one
         if not _plausible(evidence, one):

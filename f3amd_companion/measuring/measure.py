@@ -289,28 +289,11 @@ def _measure_walks(
 
 
 def measure_trained(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
-    """Write down how long every model that has weights was trained, and whether its held-out loss was flat by then.
-
-    Nothing is computed: both stand in the history beside the weights.
-
-    Returns:
-      The table, `records/trained.csv`: for each model the metrics windows, and held_out_fall, the share by which
-      the held-out loss fell over the last quarter of training (NaN where none was watched).
-    """
-    found = {name: obtain_model(prepared, profile, preset=name) for name in models or available_models(profile)}
-
-    def sum_up(row: Mapping) -> dict:
-        trained, history, _ = found[row["model"]]
-        last, fall = history["step"].max(), np.nan
-        if len(looks := history.reindex(columns=["step", "held_out_loss"]).dropna()):
-            # Between two looks the loss is taken to fall evenly with the logarithm of the steps.
-            step, loss = np.log(looks["step"].to_numpy()), looks["held_out_loss"].to_numpy()
-            fall = 1.0 - loss[-1] / np.interp(np.log(0.75 * last), step, loss, left=np.nan)
-        figures = {"windows": trained.windows_seen, "held_out_fall": fall}
-        return {"trained": pd.DataFrame(figures.items(), columns=["metric", "value"])}
-
-    todo = [{"model": name, "window_frames": profile.window} for name in found]
-    trained = {name: model for name, (model, *_) in found.items()}
+    """Write down how many windows every model that has weights was trained with: `records/trained.csv`."""
+    names = models or available_models(profile)
+    trained = {name: obtain_model(prepared, profile, preset=name)[0] for name in names}
+    sum_up = lambda row: {"trained": pd.DataFrame([{"metric": "windows", "value": trained[row["model"]].windows_seen}])}
+    todo = [{"model": name, "window_frames": profile.window} for name in trained]
     return _measure(
         profile, _record(prepared, profile, "trained"), ["trained"], todo, sum_up, again=models, trained=trained
     )
