@@ -34,12 +34,12 @@ with epy.lazy_imports():
     import pandas as pd
     import safetensors
 
-    from f3amd_companion import reproduce
+    from f3amd_companion import reproduce as notebook_runs
     from f3amd_companion.ledger import claims as ledger
     from f3amd_companion.ledger import model_cards
     from f3amd_companion.measuring import campaign as long_queue
     from f3amd_companion.measuring import measure as measuring
-    from f3amd_companion.measuring import runner, text_tables
+    from f3amd_companion.measuring import paper_tables, runner, text_tables
     from f3amd_companion.measuring import sweep as engine
     from f3amd_companion.measuring import times as measurements
     from f3amd_companion.serving import crowd as crowds
@@ -778,11 +778,11 @@ def figures(data: str = "synthetic", profile: str = "laptop", only: Repeatable =
       only: number of a notebook; repeatable.
       set: NAME=VALUE, a parameter of every notebook that runs; repeatable.
     """
-    parameters = dict(map(reproduce.parse_assignment, set))
-    reproduce.set_folders(profile)
-    took = reproduce.reproduce(data, profile, only=only, parameters=parameters, say=log.info)["seconds"]
+    parameters = dict(map(notebook_runs.parse_assignment, set))
+    notebook_runs.set_folders(profile)
+    took = notebook_runs.reproduce(data, profile, only=only, parameters=parameters, say=log.info)["seconds"]
     log.info("%d notebooks in %.1f minutes (data %s, profile %s)", len(took), took.sum() / 60, data, profile)
-    for line in reproduce.what_to_open(results_dir(data, profile)):
+    for line in notebook_runs.what_to_open(results_dir(data, profile)):
         log.info("  %s", line)
 
 
@@ -792,7 +792,7 @@ def course(only: Repeatable = ()) -> None:
     Args:
       only: number of a notebook; repeatable.
     """
-    reproduce.run_course(only, say=log.info)
+    notebook_runs.run_course(only, say=log.info)
 
 
 def claims(accept: bool = False, paper: str | None = None) -> int:
@@ -843,12 +843,67 @@ def convert(
     _say_written(target, write_whole(target.with_suffix(".md"), model_cards.released_card(trained)))
 
 
-RESUMED = ("train", "crowd", "bench", "measure", "campaign", "sweep", "figures")
+def reproduce(
+    paper: Positional[Literal["acmdm", "motionpcm", "f3amd"]], *, data: Path, table: str = "1",
+    evaluator: Path | None = None, weights: Path | None = None,
+    text_encoder: Literal["wordllama", "clip", "t5"] | None = None, text_weights: Path | None = None,
+    repeats: int | None = None, reading: str = "paper", windows: int | None = None, batch_size: int = 512,
+    profile: str = "gpu", minutes: float | None = None, seed: int = 0, out: Path | None = None,
+) -> int:  # fmt: skip
+    """Print a paper's own table with yours beside it, from its data and weights (docs/reproduce.md).
+
+    Args:
+      data: HumanML3D's or KIT-ML's folder; for f3amd 100STYLE's archive or folder.
+      table: its number; for f3amd both, 3 and 5.
+      evaluator: folder of the published evaluator: arrays (.safetensors), means and deviations, words.
+      weights: folder of models by their presets' names, converted, released (.safetensors) or your own; without it
+        real motion alone is measured.
+      text_encoder: what embeds the models' captions; by default the paper's.
+      text_weights: folder of its weights.
+      repeats: instead of 20; fewer are a look, no measurement.
+      reading: for f3amd a row of recipes.toml, or several joined by +.
+      windows: for f3amd how many are trained on, instead of 100 epochs.
+      batch_size: of that training.
+      profile: for f3amd gpu, laptop or smoke.
+      minutes: stop then; a later call goes on, and the exit status is 3.
+      seed: of captions, crops and noise.
+      out: folder of the records instead of runs/.
+    """
+    terminal.check_there(data, evaluator, weights, text_weights)
+    if paper == "f3amd":
+        motion = Data("100style", profile, str(data))
+        long_queue.find_recipe(reading)
+        prepared, numbers = motion.open()
+        folder = out or runs_dir("100style", profile) / "reproduced"
+        with locked(folder / ".f3amd.lock", "reproducing F3AMD"):
+            given = prepared, numbers, *measuring.protocol_of(prepared, numbers, "reproduced")[:2]
+            how = {"folder": folder, "reading": reading, "num_windows": windows, "batch_size": batch_size, "seed": seed}
+            paths = long_queue.reproduce_own(*given, **how, stop_at=_stop_at(minutes))
+        return _say_reproduced(paths)
+    if evaluator is None:
+        raise ValueError("--evaluator is needed: the folder of the published one, see docs/reproduce.md")
+    folder = out or runs_dir("folder", "gpu") / "reproduced" / paper
+    given = paper_tables.Sources(data, evaluator, weights, text_encoder, text_weights)
+    with locked(folder / f".{table}.lock", f"reproducing table {table}"):
+        how = {"out": folder, "repeats": repeats, "seed": seed, "stop_at": _stop_at(minutes)}
+        path = paper_tables.reproduce_table(paper, table, given, **how)
+    return _say_reproduced(path and [path])
+
+
+def _say_reproduced(paths: Sequence[Path] | None) -> int:
+    """Show tables beside the paper's; return the exit status, of None that of an unfinished run."""
+    for path in paths or ():
+        log.info("\n%s\n", tables.markdown_table(records.read_table(path)[0], digits=3))
+        _say_written(path)
+    return UNFINISHED if paths is None else 0
+
+
+RESUMED = ("train", "crowd", "bench", "measure", "campaign", "sweep", "figures", "reproduce")
 """Commands that leave whole what they have done, and go on from it."""
 
 COMMANDS = (
     data, joints, dataset, styles, presets, train, rollout, text, crowd, export, steer, bench, measure, campaign, sweep,
-    figures, course, claims, cards, convert,
+    figures, course, claims, cards, convert, reproduce,
 )  # fmt: skip
 
 

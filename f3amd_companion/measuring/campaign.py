@@ -26,6 +26,7 @@ import time
 from collections import ChainMap
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -34,7 +35,8 @@ import jax.numpy as jnp
 import pandas as pd
 
 import f3amd_lib
-from f3amd_companion.measuring.fingerprint import real_rows, walk_rows, window_rows
+from f3amd_companion.measuring.fingerprint import likeness_of_readings, real_rows, walk_rows, window_rows
+from f3amd_companion.measuring.paper_tables import beside_paper
 from f3amd_companion.measuring.runner import Records, records_folder
 from f3amd_companion.speed.machine import device_name, matmul_precision, prepared_at_once
 from f3amd_lib.data.windows import WindowSet
@@ -42,17 +44,18 @@ from f3amd_lib.ground.files import read_toml
 from f3amd_lib.ground.names import check_known
 from f3amd_lib.ground.papers import check_entry, load_paper_file
 from f3amd_lib.ground.profiles import Profile
-from f3amd_lib.ground.records import run_record
+from f3amd_lib.ground.records import read_table, run_record, write_table
 from f3amd_lib.ground.trees import errors_name, weights_digest
 from f3amd_lib.measures.classifier import StyleClassifier
 from f3amd_lib.measures.denoising import held_out_condition, held_out_error, input_use, noise_use
 from f3amd_lib.measures.protocol import Protocol, held_out_clips, measure_model
 from f3amd_lib.measures.registry import METRICS
 from f3amd_lib.networks import presets
+from f3amd_lib.papers.printed import SCHEMAS, printed_tables
 from f3amd_lib.rollout.rollout import MotionGenerator
 from f3amd_lib.training.checkpoints import TrainedModel, load_model, save_model
 from f3amd_lib.training.denoising_task import DenoisingTask
-from f3amd_lib.training.optimise import compile_steps, held_out_terms, restore_state
+from f3amd_lib.training.optimise import compile_steps, held_out_terms, initial_state, restore_state
 from f3amd_lib.training.pipeline import ModelFiles, PreparedData, as_trained, set_aside_run, train_in_legs
 from f3amd_lib.training.recipe import TrainingConfig, paper_recipe
 
@@ -277,7 +280,8 @@ def run_campaign(
     """
     check_precision(precision)
     snapshots, measured = list(snapshots), classifier is not None
-    protocol = replace(protocol, num_seeds=1) if measured else None
+    if measured and table != "reproduced":
+        protocol = replace(protocol, num_seeds=1)
     seed, about = (protocol.path_seed, {"protocol": asdict(protocol)}) if measured else (0, {})
     record = run_record(
         profile=profile, dataset=prepared.packed, seed=seed, measurement=table if measured else "package",
@@ -370,7 +374,8 @@ def _measured(prepared, classifier, protocol, run: Run, windows: int, table: str
     data, trained, loss, config = done
     log.info("measuring %s after %s windows", run.name, f"{windows:,}")
     held_out, seed = data.windows(data.held_out_split), protocol.path_seed
-    measure = {"campaign": _campaign_rows, "readings": _reading_rows}[table]
+    of_paper = partial(_campaign_rows, steps=(8, 4, 2, 1))
+    measure = {"campaign": _campaign_rows, "readings": _reading_rows, "reproduced": of_paper}[table]
     rows = measure(trained, data, classifier, protocol, held_out)
     use = input_use(trained, held_out_condition(held_out, trained), num_levels=STEPS_MEASURED[0], seed=seed)
     use = use.assign(steps=STEPS_MEASURED[0])[["metric", "unit", "value", "steps"]]
@@ -388,10 +393,13 @@ def _measured(prepared, classifier, protocol, run: Run, windows: int, table: str
     return pd.concat([rows, use, of_windows]).assign(**columns)
 
 
-def _campaign_rows(trained, data: PreparedData, classifier, protocol: Protocol, held_out: WindowSet) -> pd.DataFrame:
-    generators = [MotionGenerator(trained, count) for count in STEPS_MEASURED]
+def _campaign_rows(
+    trained, data: PreparedData, classifier, protocol: Protocol, held_out: WindowSet, steps=STEPS_MEASURED
+) -> pd.DataFrame:
+    generators = [MotionGenerator(trained, count) for count in steps]
     tables = [measure_model(one, data.packed, classifier, protocol, held_out)[0] for one in generators]
-    return pd.concat(tables)[["steps", "metric", "unit", "value"]]
+    bounds = [] if steps == STEPS_MEASURED else ["low", "high"]  # of one seed there are none
+    return pd.concat(tables)[["steps", "metric", "unit", "value", *bounds]]
 
 
 def _reading_rows(trained, data: PreparedData, classifier, protocol: Protocol, held_out: WindowSet) -> pd.DataFrame:
@@ -402,3 +410,78 @@ def _reading_rows(trained, data: PreparedData, classifier, protocol: Protocol, h
     if trained.diffusion.kind == "variance_exploding":
         tables.append(window_rows(trained, held_out, seed=protocol.path_seed))
     return pd.concat(tables, ignore_index=True)
+
+
+# ------------------------------------------------------------------------------------------- a reader's own training
+
+
+def own_queue(reading: str, num_windows: int, seed: int = 0) -> list[tuple[Run, int]]:
+    """Return the snapshots of F3AMD-FNO-96 and CAMDM by a reading of the paper: at a tenth, a third and the end.
+
+    Args:
+      reading: a recipe, or several joined by "+"; CAMDM is trained by the paper's where it is no change of CAMDM.
+      num_windows: that each sees in all.
+      seed: of weights and batches.
+    """
+    recipe = find_recipe(reading)
+    try:
+        others = recipe.on("CAMDM").name
+    except ValueError:
+        others = "paper"
+    runs = Run("F3AMD-FNO-96", reading, seed=seed), Run("CAMDM", others, seed=seed)
+    return [(run, max(1, num_windows // part)) for run in runs for part in (10, 3, 1)]
+
+
+def hours_of(prepared: PreparedData, snapshots, batch_size: int, precision: str = "float32", chunk: int = 10) -> dict:
+    """Return the hours that each run's training would take here, by name: `chunk` steps are timed, after as many."""
+    hours = {}
+    for run, windows in sorted(snapshots, key=lambda snapshot: snapshot[1]):  # the longest last
+        task = _laid_out(prepared, run, batch_size)[1]
+        if run.name not in hours:
+            with matmul_precision(precision):
+                state, program = initial_state(task), compile_steps(task, chunk)
+            for _ in range(2):
+                started = time.perf_counter()
+                state = jax.block_until_ready(program(task, state)[0])
+            seconds = (time.perf_counter() - started) / chunk
+        hours[run.name] = seconds * windows / task.config.batch_size / 3600.0
+    return hours
+
+
+def reproduce_own(
+    prepared: PreparedData, profile: Profile, classifier: StyleClassifier, protocol: Protocol, *, folder, reading: str,
+    num_windows: int | None = None, batch_size: int = 512, seed: int = 0, **how,
+) -> tuple[Path, Path] | None:  # fmt: skip
+    """Train F3AMD-FNO-96 and CAMDM by a reading and lay Tables 3 and 5 beside the paper's.
+
+    Args:
+      prepared, profile, classifier, protocol, folder: as for `run_campaign`.
+      reading: as for `own_queue`.
+      num_windows: that are trained on; by default the paper's 100 epochs.
+      batch_size, seed: of the training.
+      **how: precision, stop_at and progress, as for `run_campaign`.
+
+    Returns:
+      (`records/reproduced_beside_paper.csv`; `records/reproduced_likeness.csv`, the distance to the paper's fingerprint
+      line by line, under each grid and update); None where the time was over first.
+    """
+    total = num_windows or EPOCHS * prepared.windows("train").num_windows
+    snapshots = own_queue(reading, total, seed)
+    for name, hours in hours_of(prepared, snapshots, batch_size, how.get("precision", "float32")).items():
+        log.info("training     %s: about %.1f hours here, for %s windows", name, hours, f"{total:,}")
+    runs = prepared, profile, classifier, protocol
+    for table in ("reproduced", "readings"):  # the fingerprint is F3AMD's
+        some = [one for one in snapshots if table == "reproduced" or one[0].preset != "CAMDM"]
+        left = {"folder": folder, "snapshots": some, "batch_size": batch_size, "table": table}
+        for name, windows, state in run_campaign(*runs, **left, **how):
+            log.info("%-12s %s, %s windows", state, name, f"{windows:,}")
+            if state == "unfinished":
+                return None
+    place = records_folder(profile)
+    (made, record), (readings, of_readings) = (read_table(place / f"{one}.csv") for one in ("reproduced", "readings"))
+    made = made[made["run"].isin([run.name for run, _ in snapshots]) & (made["windows"] == total)]
+    made = made.assign(window_frames=prepared.window)
+    printed = printed_tables()["quality"]
+    printed = printed[printed["model"].isin(made["model"]) & (printed["window_frames"] == prepared.window)]
+    beside = write_table(place / "reproduced_beside_paper.csv", beside_paper(printed, made, SCHEMAS["quality"]), record)
+    return beside, write_table(place / "reproduced_likeness.csv", likeness_of_readings(readings), of_readings)

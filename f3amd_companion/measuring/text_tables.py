@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +25,7 @@ import numpy as np
 import pandas as pd
 
 from f3amd_companion.measuring.runner import Records, records_folder
+from f3amd_lib.ground.arrays import in_batches
 from f3amd_lib.ground.names import check_known
 from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.ground.profiles import Profile, runs_dir
@@ -84,6 +86,16 @@ class Bench:
     real: TextMotions
     settings: Mapping
     seed: int
+    vectors: ClassVar[bool] = False
+    """Whether the judge sees the redundant vectors that a network makes, not positions."""
+
+    def repeated(self) -> list[Bench]:
+        """Return the benches that a row is measured on; each repeats what it can by itself."""
+        return [self]
+
+    def embed(self, motions) -> np.ndarray:
+        """Return motions as the judge's vectors, [N, D]."""
+        return self.judge.embed_motions(motions)
 
     def captions(self, repeat: int) -> tuple[list[str], np.ndarray]:
         """Return a caption of each clip and their embeddings [N, W], drawn anew in each repeat."""
@@ -128,17 +140,20 @@ class Bench:
     def variety(self, make: Callable) -> pd.DataFrame:
         """Return how far motions of one caption lie from each other before the judge, over one group of captions.
 
-        As many motions are made at once as in `quality`, so that nothing is compiled again.
+        As many motions are made at once as in `quality`, so that nothing is compiled again. Settings may say how many
+        captions (`varied`), and how many motions of each (`samples`).
         """
-        count = min(self.settings["group"], self.real.num_clips // 2)
-        clips, made = np.arange(self.real.num_clips) % count, []
+        count = min(self.settings.get("varied", self.settings["group"]), self.real.num_clips // 2)
+        clips, made, at_once = np.arange(self.real.num_clips) % count, [], self.real.num_clips // count
+        samples = self.settings.get("samples", _VARIETY_DRAWS * at_once)
         pooled, lengths = self.captions(0)[1][clips], self.real.lengths[clips]
-        for number in range(_VARIETY_DRAWS):
+        for number in range(-(-samples // at_once)):
             key = jax.random.fold_in(jax.random.key(self.seed), self.settings["repeats"] + number)
             motions = [one[:length] for one, length in zip(make(pooled, lengths, key), lengths, strict=True)]
-            embedded = self.judge.embed_motions(motions)
-            made.append(embedded[: len(clips) // count * count].reshape(-1, count, embedded.shape[-1]))
-        far = text_metrics.multimodality(np.swapaxes(np.concatenate(made), 0, 1), np.random.default_rng([self.seed, 4]))
+            embedded = self.embed(motions)
+            made.append(embedded[: at_once * count].reshape(at_once, count, embedded.shape[-1]))
+        made = np.swapaxes(np.concatenate(made)[:samples], 0, 1)
+        far = text_metrics.multimodality(made, np.random.default_rng([self.seed, 4]))
         return pd.DataFrame([{"metric": "multimodality", "value": far}])
 
     def look(self, motions, told) -> dict[str, float]:
@@ -159,11 +174,26 @@ class Bench:
 
 # --------------------------------------------------------------------------------------------------------- whole motion
 
+_AT_ONCE = 256
+"""Motions that are drawn together: a test split of thousands would not fit into memory."""
+
+
+def in_parts(draw: Callable) -> Callable:
+    """Return `draw(pooled, mask, key)`, asked for parts of one shape where there are more than `_AT_ONCE` motions."""
+
+    def parts(pooled, mask, key, control=None):
+        if len(mask) <= _AT_ONCE:
+            return draw(pooled, mask, key)
+        part = lambda rows: draw(pooled[rows], mask[rows], jax.random.fold_in(key, rows[0]))
+        return in_batches(part, len(mask), _AT_ONCE)
+
+    return parts
+
 
 def whole_rows(bench: Bench, trained: TextModel, row: Mapping, about: Mapping, first: TextModel | None) -> pd.DataFrame:
     """Return the figures of a model that makes whole motions; with cfg "no" without guidance."""
     how = {"num_steps": bench.num_steps(trained), "guidance": 1.0 if row.get("cfg") == "no" else None}
-    draw = motion_drawer(trained, **how)
+    draw = in_parts(motion_drawer(trained, **how))
     make = lambda *asked: draw_motions(trained, *asked, draw=draw)
     return pd.concat([bench.quality(make), bench.variety(make)])
 
@@ -366,8 +396,13 @@ def latent_rows(bench: Bench, trained: LatentModel | None, row: Mapping, about: 
     """Return the figures of a teacher or a student of MotionPCM in so many steps; without a model, of real motion."""
     if trained is None:
         return bench.quality(lambda *asked: map(bench.real.clip, range(bench.real.num_clips)))
-    draw = motionpcm_sampling.latent_sampler(trained, row.get("steps"), row.get("guidance"))
-    made = bench.quality(lambda *asked: motionpcm_sampling.latent_motions(trained, *asked, draw=draw))
+    draw = in_parts(motionpcm_sampling.latent_sampler(trained, row.get("steps"), row.get("guidance")))
+    make = lambda *asked: motionpcm_sampling.latent_motions(trained, *asked, draw=draw)
+    if bench.vectors:
+        make = lambda pooled, lengths, key: np.asarray(draw(pooled, frame_mask(lengths, int(lengths.max())), key))
+    made = bench.quality(make)
+    if "samples" in bench.settings:
+        made = pd.concat([made, bench.variety(make)])
     if not about.get("timed"):
         return made
     taken = {"metric": "sampling_seconds", "value": sentence_seconds(bench, trained, draw)}
@@ -384,26 +419,26 @@ def reconstruction_rows(bench: Bench, trained: LatentModel, row: Mapping, about:
     real, most = bench.real, int(bench.real.lengths.max())
     vectors = real.redundant_vectors(released=trained.autoencoder.released_facing)
     clips = [vectors[first:last] for first, last in zip(real.start[:-1], real.start[1:], strict=True)]
-    motions, apart, moved = [], [], []
+    motions, given_back, apart, moved = [], [], [], []
     spread = lambda vectors: np.sum(np.var(vectors / np.asarray(trained.statistics.deviation), axis=0))
     for begin in range(0, len(clips), 64):
         padded = pad_motions(clips[begin : begin + 64], most)
         made, positions = motionpcm_sampling.reconstruction(trained, padded.motion, padded.mask)
         for number, length in enumerate(np.asarray(padded.length)):
             motions.append(positions[number, :length])
-            away = (made[number, :length] - clips[begin + number]) / np.asarray(trained.statistics.deviation)
+            given_back.append(made[number, :length])
+            away = (given_back[-1] - clips[begin + number]) / np.asarray(trained.statistics.deviation)
             apart.append(np.linalg.norm(away))
-            moved.append([spread(made[number, :length]), spread(clips[begin + number])])
+            moved.append([spread(given_back[-1]), spread(clips[begin + number])])
     local = lambda motion: motion - motion[:, :1]
     pairs = zip(map(local, motions), map(local, map(real.clip, range(real.num_clips))), strict=True)
     errors = [np.linalg.norm(ours - true, axis=-1).mean(axis=-1) for ours, true in pairs]
-    made = np.asarray(pad_motions(motions, most).motion)
     own = pd.DataFrame([
         {"metric": "reconstruction_error", "value": 1000.0 * float(np.concatenate(errors).mean())},
         {"metric": "feature_error", "value": float(np.sum(apart) / real.lengths.sum())},
         {"metric": "kept_movement", "value": float(np.divide(*np.sum(moved, axis=0)))},
     ])  # fmt: skip
-    return pd.concat([bench.quality(lambda *asked: made), own])
+    return pd.concat([bench.quality(lambda *asked: given_back if bench.vectors else motions), own])
 
 
 # ----------------------------------------------------------------------------------------------------------- the runner
@@ -425,6 +460,14 @@ def obtain_judge(data: TextMotions, encoder: TextEncoder, profile: Profile, *, f
     # A check of the way needs no judge that sees.
     training = EvaluatorTraining(num_steps=profile.train_steps) if profile.name == "smoke" else None
     return train_judge(data, encoder, training, files=files, **leg)
+
+
+def _over_repeats(tables: list[pd.DataFrame]) -> pd.DataFrame:
+    """Return the one table as it is, or the means of several with intervals."""
+    if len(tables) == 1:
+        return tables[0]
+    together = pd.concat(tables)
+    return intervals_over_repeats(together, [column for column in ("joint", "frames", "metric") if column in together])
 
 
 REAL = "Real"
@@ -521,43 +564,67 @@ def measure_text_table(
         brief = dataclasses.replace(profile, train_steps=settings.get("train_steps", profile.train_steps))
         return train_stage(cut, encoder, brief, preset, batch_size=settings.get("batch_size"), **where)
 
-    once = [(row, profile.seed, 1.0) for row in rows]
-    for row, seed, length in planned(once, settings, name in settings["compared"]) if plan else once:
-        if asked and row["model"] not in asked:
-            continue
+    once = [(row, profile.seed, 1.0) for row in rows if not asked or row["model"] in asked]
+    if plan:
+        once = planned(once, settings, name in settings["compared"])
+        rows = [row | {"seed": seed, "length": length} for row, seed, length in once]
+    else:
+        rows = [row for row, *_ in once]
+    watched = partial(_watched, profile, apart) if plan else None
+    return measure_rows(name, rows, about, records, bench, trained, leg.get("stop_at"), watched)
+
+
+def _watched(profile: Profile, folder: Path, row: Mapping, model) -> tuple[dict, pd.DataFrame]:
+    """Return what a row of the plan says besides, its model's size, and the last held-out loss."""
+    if model is None:
+        return {"parameters": 0}, pd.DataFrame()
+    files = text_models.text_model_files(profile, model.name, folder=folder / f"seed{row['seed']}-{row['length']:g}")
+    loss = read_table(files.history)[0]["held_out_loss"].dropna().iloc[-1]
+    size = sum(leaf.size for leaf in jax.tree.leaves(_judged(model)))
+    return {"parameters": size}, pd.DataFrame([{"metric": "held_out_loss", "value": loss}])
+
+
+def measure_rows(
+    name: str, rows: Iterable[Mapping], about: Mapping, records: Records, bench: Bench, find: Callable,
+    stop_at: float | None = None, watched: Callable | None = None,
+) -> Path | None:  # fmt: skip
+    """Measure the rows of a table that its records lack; return the table, or None where the time was over first.
+
+    Args:
+      name, about: of the table; `about` has the key of `KINDS` that measures it.
+      rows: each with `trained`, the preset that is measured, and perhaps `first`, `section`, `seed`, `length`.
+      records, bench: where rows are kept, and what they are measured with.
+      find: preset, perhaps with a branch behind it, seed and length where a row has them -> model; None where there
+        was no time for it.
+      stop_at: do not begin a row after this time (`time.monotonic`).
+      watched: (row, model) -> more columns, and figures of its training.
+    """
+    for row in rows:
         model = first = None
         if row["trained"] != REAL:
-            model = trained(row["trained"] + BRANCHES.get(row.get("section"), ""), seed, length)
-            if model is not None and "first" in row:
-                first = trained(row["first"])
-                model = None if first is None else model
-            if model is None:
+            asked = [row[key] for key in ("seed", "length") if key in row]
+            model = find(row["trained"] + BRANCHES.get(row.get("section"), ""), *asked)
+            first = find(row["first"]) if model is not None and "first" in row else None
+            if model is None or ("first" in row and first is None):
                 return None
-        if leg.get("stop_at") is not None and time.monotonic() >= leg["stop_at"]:
+        if stop_at is not None and time.monotonic() >= stop_at:
             return None
         named = row | {"windows": 0, "weights": weights_digest(bench.judge.params)}
         if model is not None:
             told = model.record["identity"]["training"]
-            steps = model.record.get("stopped_at_step", told["num_steps"])
+            steps = model.record.get("stopped_at_step", told.get("num_steps", 0))  # nobody knows of released weights
             named |= {"windows": steps * told["batch_size"], "weights": weights_digest(_judged(model))}
-        loss = None
-        if plan:
-            size = 0 if model is None else sum(leaf.size for leaf in jax.tree.leaves(_judged(model)))
-            named |= {"seed": seed, "length": length, "parameters": size}
-            if model is not None:
-                files = text_models.text_model_files(profile, model.name, folder=apart / f"seed{seed}-{length:g}")
-                loss = {
-                    "metric": "held_out_loss",
-                    "value": read_table(files.history)[0]["held_out_loss"].dropna().iloc[-1],
-                }
+        more, figures = ({}, None) if watched is None else watched(row, model)
+        named |= more
 
-        def measured(row: Mapping, model=model, first=first, loss=loss) -> dict:
-            made = KINDS[about["kind"]](bench, model, row, about, first)
-            made = made if isinstance(made, dict) else {name: made}
-            if loss:
+        def measured(row: Mapping, model=model, first=first, figures=figures) -> dict:
+            made = [KINDS[about["kind"]](one, model, row, about, first) for one in bench.repeated()]
+            made = [one if isinstance(one, dict) else {name: one} for one in made]
+            made = {table: _over_repeats([one[table] for one in made]) for table in made[0]}
+            if figures is not None and len(figures):
                 what = [column for column in made[name] if column not in ("metric", "value", "low", "high")]
                 places = made[name][what].drop_duplicates() if what else pd.DataFrame([{}])
-                made[name] = pd.concat([made[name], places.assign(**loss)])
+                made[name] = pd.concat([made[name], places.merge(figures, how="cross")])
             return made
 
         records.measure([named], measured)

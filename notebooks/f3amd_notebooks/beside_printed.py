@@ -4,8 +4,10 @@ from collections.abc import Sequence
 
 import pandas as pd
 from f3amd_lib.ground.papers import has_paper_file, load_paper_file, paper_folders
+from f3amd_lib.ground.profiles import runs_dir
+from f3amd_lib.ground.records import read_table
 from f3amd_lib.ground.stored import committed_table, measured_table
-from f3amd_lib.ground.tables import ARROWS
+from f3amd_lib.ground.tables import ARROWS, markdown_table
 from f3amd_lib.measures.registry import METRICS
 from f3amd_lib.papers.printed import SCHEMAS, printed_tables
 
@@ -60,3 +62,27 @@ def judge_note(name: str) -> str:
         f"The judge of `{name}` (weights {judges[name]}) is another than that of {', '.join(others)}: it was "
         "trained anew. Compare FID, R-precision and their like within one judge's tables alone."
     )
+
+
+WHOSE = {
+    "paper": "the paper's, as printed",
+    "ours": "ours, at our scale: small networks, minutes of training",
+    "yours": "yours, measured by `f3amd reproduce`",
+}
+"""What the figures of a table of a text notebook may be."""
+
+
+def whose_table(paper: str, number: str, *shown: str) -> str:
+    """Return a table's caption: which of `WHOSE` its figures are; the reader's own table follows, if there is one.
+
+    Args:
+      paper: a folder of `papers/`.
+      number: of the paper's table; "" for one that the paper has not.
+      shown: keys of `WHOSE`, what the table above the caption has.
+    """
+    caption = f"\n\n*Figures: {'; beside them '.join(WHOSE[whose] for whose in shown)}.*"
+    record = {entry["number"]: entry["record"] for entry in load_paper_file("paper", paper)["table"]}.get(number)
+    path = runs_dir("folder", "gpu") / "reproduced" / paper / f"{record}_beside_paper.csv"
+    if record is None or not path.is_file():
+        return caption
+    return f"{caption}\n\n{markdown_table(read_table(path)[0], digits=3)}\n\n*Figures: {WHOSE['yours']}.*"
