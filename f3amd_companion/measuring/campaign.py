@@ -48,6 +48,7 @@ from f3amd_lib.ground.records import read_table, run_record, write_table
 from f3amd_lib.ground.trees import errors_name, weights_digest
 from f3amd_lib.measures.classifier import StyleClassifier
 from f3amd_lib.measures.denoising import held_out_condition, held_out_error, input_use, noise_use
+from f3amd_lib.measures.distributions import intervals_over_repeats
 from f3amd_lib.measures.protocol import Protocol, held_out_clips, measure_model
 from f3amd_lib.measures.registry import METRICS
 from f3amd_lib.networks import presets
@@ -398,8 +399,8 @@ def _campaign_rows(
 ) -> pd.DataFrame:
     generators = [MotionGenerator(trained, count) for count in steps]
     tables = [measure_model(one, data.packed, classifier, protocol, held_out)[0] for one in generators]
-    bounds = [] if steps == STEPS_MEASURED else ["low", "high"]  # of one seed there are none
-    return pd.concat(tables)[["steps", "metric", "unit", "value", *bounds]]
+    table = pd.concat(tables)[["steps", "metric", "unit", "value"]]
+    return table if steps == STEPS_MEASURED else intervals_over_repeats(table, ["steps", "metric", "unit"])
 
 
 def _reading_rows(trained, data: PreparedData, classifier, protocol: Protocol, held_out: WindowSet) -> pd.DataFrame:
