@@ -75,10 +75,15 @@ def test_the_queue_names_each_snapshot_once_and_holds_what_the_tables_need():
     assert names[0][0] == "F3AMD-FNO-96-seed0" and names[-1] == ("F3AMD-FNO-96-seed0", 19_400_000)
 
 
-def test_nothing_is_done_after_what_is_unfinished():
-    states = iter(("kept", "unfinished", "kept"))
-    done = list(campaign._in_turn(queue()[:3], lambda *_: next(states)))
-    assert [state for *_, state in done] == ["kept", "unfinished"]
+def test_nothing_is_done_after_what_is_unfinished(tmp_path, monkeypatch):
+    made = iter((("weights",), None, ("weights",)))
+    monkeypatch.setattr(campaign, "_trained", lambda *_, **__: next(made))
+    monkeypatch.setattr(campaign, "run_record", lambda **_: {})
+    monkeypatch.setattr(campaign, "compile_steps", lambda *_: None)
+    monkeypatch.setattr(campaign, "_laid_out", lambda *_: (None, None))
+    prepared = SimpleNamespace(packed=None)
+    legs = campaign.run_campaign(prepared, None, folder=tmp_path, snapshots=queue()[:3])
+    assert [state for *_, state in legs] == ["kept", "unfinished"]
 
 
 def test_snapshots_of_one_run_are_trained_alike_whatever_comes_after_them():

@@ -43,6 +43,7 @@ def test_real_motion_tells_whether_data_and_evaluator_are_right(caplog):
     """The printed figures are right; another evaluator's are not, nor is a data set of which nothing is printed."""
     rows = [("R_precision_3", 0.795, 0.002), ("matching_distance", 3.244, 0.005)]
     printed = pd.DataFrame([{"metric": m, "low": v - c, "value": v, "high": v + c} for m, v, c in rows])
+    caplog.set_level("WARNING", logger="f3amd")
     assert check_real("acmdm", printed, printed) and not caplog.text
     other = printed.assign(**{bound: printed[bound] - [0.0, 0.27] for bound in ("low", "value", "high")})
     assert not check_real("acmdm", printed, other) and "off by more than its interval" in caplog.text

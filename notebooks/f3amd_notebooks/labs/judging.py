@@ -103,9 +103,9 @@ def known(name: str, denoise: Callable, x, grid, rng: np.random.Generator | None
     sampler = SAMPLERS[name]
     for number, (sigma, lower) in enumerate(zip(grid[:-1], grid[1:], strict=True)):
         ends = sampler.last and number == len(grid) - 2
-        more = (
-            [] if ends else [rng.standard_normal(x.shape)] * sampler.draws_noise + [denoise] * (sampler.evaluations > 1)
-        )
+        more = [] if ends or sampler.evaluations == 1 else [denoise]
+        if sampler.draws_noise:
+            more = [rng.standard_normal(x.shape)]
         x = (sampler.last if ends else sampler.step)(x, denoise(x, sigma), sigma, lower, *more)
     return x
 
