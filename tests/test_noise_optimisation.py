@@ -67,7 +67,7 @@ def test_a_target_is_met_and_only_its_noise_has_moved():
 @pytest.mark.slow
 def test_noise_of_its_own_does_not_go_together_and_repeated_noise_does():
     noise = normal(1, 4, 64, 5, 3)
-    assert np.all(correlation(noise) < 0.1)
+    assert np.all(correlation(noise) < 0.2)
     assert np.all(correlation(jnp.broadcast_to(noise[:, :1], noise.shape)) > 1.0)
 
 

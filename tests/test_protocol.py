@@ -82,9 +82,17 @@ TEXT_METRICS = {metric.name for table in TEXT_TABLES for metric in SHOWN[table]}
 PROTOCOL_METRICS = (
     set(METRICS)
     - TEXT_METRICS
-    - {"stepping_rate", "slide_speed", "sliding_share", "floor_penetration", "seam_kick", "foot_all_frames"}
+    - {
+        "stepping_rate",
+        "slide_speed",
+        "sliding_share",
+        "floor_penetration",
+        "seam_kick",
+        "foot_all_frames",
+        "acceleration_ratio",
+    }
 )
-"""All but what `measure walking` and the queue of readings measure."""
+"""All but what `measure walking` and the queues of readings and of text measure."""
 
 
 def one(rows: pd.DataFrame, metric: str, seed: int = 0) -> float:
