@@ -32,6 +32,7 @@ from f3amd_lib.ground.profiles import Profile, runs_dir
 from f3amd_lib.ground.records import read_table, run_record, write_table
 from f3amd_lib.ground.trees import weights_digest
 from f3amd_lib.measures.distributions import intervals_over_repeats
+from f3amd_lib.measures.metrics import joint_acceleration
 from f3amd_lib.motion.skeleton import Motion, Skeleton, mirror
 from f3amd_lib.networks import presets
 from f3amd_lib.text.data.text_encoders import TextEncoder, embed_captions
@@ -116,14 +117,14 @@ class Bench:
 
     def _seen(self, system: Callable, repeats: int) -> pd.DataFrame:
         """Return metric, value, low and high of a system as `judge_motions` knows it, foot skating among them."""
-        seen, real = [], list(map(self.real.clip, range(self.real.num_clips)))
-        shaking = lambda clips: np.mean([np.linalg.norm(np.diff(clip, 2, axis=0), axis=-1).mean() for clip in clips])
+        seen, shaking = [], lambda clips: np.mean([joint_acceleration(clip, self.real.fps) for clip in clips])
+        real = shaking(map(self.real.clip, range(self.real.num_clips)))
 
         def watched(repeat: int):
             motions, told = system(repeat)
             shares = [text_metrics.foot_skating_ratio(self.real.skeleton, each, self.real.fps) for each in motions]
             seen.append({"metric": "foot_skating", "value": np.mean(shares)})
-            seen.append({"metric": "acceleration_ratio", "value": shaking(motions) / shaking(real)})
+            seen.append({"metric": "acceleration_ratio", "value": shaking(motions) / real})
             return motions, told
 
         table = self.judged({"made": watched}, repeats)
@@ -515,7 +516,7 @@ def measure_text_table(
       models: rows of these models alone, which are measured again.
       folder: where judge and weights lie instead of `runs/`.
       rows: instead of the file's.
-      plan: settings of the file instead of the profile's: of "queue" each row is trained to several lengths, and and
+      plan: settings of the file instead of the profile's: of "queue" each row is trained to several lengths, and
         in its `compared` tables with several seeds.
       **leg: stop_at and progress, as for `optimise`.
 
@@ -564,12 +565,11 @@ def measure_text_table(
         brief = dataclasses.replace(profile, train_steps=settings.get("train_steps", profile.train_steps))
         return train_stage(cut, encoder, brief, preset, batch_size=settings.get("batch_size"), **where)
 
-    once = [(row, profile.seed, 1.0) for row in rows if not asked or row["model"] in asked]
+    rows = [row for row in rows if not asked or row["model"] in asked]
     if plan:
-        once = planned(once, settings, name in settings["compared"])
-        rows = [row | {"seed": seed, "length": length} for row, seed, length in once]
-    else:
-        rows = [row for row, *_ in once]
+        once = [(row, profile.seed, 1.0) for row in rows]
+        every = planned(once, settings, name in settings["compared"])
+        rows = [row | {"seed": seed, "length": length} for row, seed, length in every]
     watched = partial(_watched, profile, apart) if plan else None
     return measure_rows(name, rows, about, records, bench, trained, leg.get("stop_at"), watched)
 

@@ -416,13 +416,15 @@ def resample(motion: Motion, fps: float = 30.0, *, smooth: bool = False) -> Moti
     high = np.minimum(low + 1, motion.num_frames - 1)
     weight, known = (times - low)[:, None], np.arange(motion.num_frames)
 
+    smooth &= len(known) > 1  # one frame has no curve
+
     def between(name, array):
-        if smooth and len(known) > 1 and name == "rotations":
+        if smooth and name == "rotations":
             joints = (RotationSpline(known, Rotation.from_matrix(of_joint)) for of_joint in np.moveaxis(array, 1, 0))
             return np.stack([joint(times).as_matrix() for joint in joints], axis=1)
         if name == "rotations":
             return slerp_matrices(array[low], array[high], weight)
-        if smooth and len(known) > 1:
+        if smooth:
             return CubicSpline(known, array)(times)
         across = weight.reshape(-1, *[1] * (array.ndim - 1))
         return (1 - across) * array[low] + across * array[high]
