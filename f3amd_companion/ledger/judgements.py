@@ -51,8 +51,11 @@ Finding = tuple[str, str]
 TOLERANCE = 0.10
 """Slack of a stated factor. The paper gives its factors with one or two digits and a "~"."""
 
-SAVING_SLACK = 2.0
-"""Slack of a stated share of time saved, %. Medians of repeated runs differ by a percent or two."""
+ROUNDING = 0.05
+"""Slack of a stated range of factors, whose ends are rounded."""
+
+SAVING_SLACK = 0.5
+"""Slack of a stated share of time saved, %: the paper rounds to whole percents."""
 
 CONVERGED = 0.05
 """A metric has converged in the first epoch that comes this close to its best."""
@@ -153,7 +156,7 @@ def equal_range(slack: float) -> tuple[float, float]:
 
 RANGES = {
     "within": lambda low, high: (low, high),
-    "stated": lambda low, high: (low * (1.0 - TOLERANCE), high * (1.0 + TOLERANCE)),
+    "stated": lambda low, high: (low * (1.0 - ROUNDING), high * (1.0 + ROUNDING)),
     "about": stated_factor,
     "alike": equal_range,
     "saving": lambda low, high: (low - SAVING_SLACK, high + SAVING_SLACK),
