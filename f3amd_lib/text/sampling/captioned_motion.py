@@ -179,6 +179,8 @@ def animate(
             which, (frames, points) = find_joint(trained, joint), read_control_csv(control, num_frames)
             how["control"] = control_of(trained, which, frames, points, num_frames)
         positions = draw_motions(trained, pooled, num_frames, key, **how)[0]
+        if control is None:  # whose points lie where they are
+            positions = positions - positions[0, 0] * (1, 0, 1)
     motion, moved = fitted(Motion.from_positions(trained.skeleton, positions, trained.fps, ", then ".join(captions)))
     if control is not None:
         missed = np.linalg.norm(motion.positions[frames, which] - points, axis=-1)
