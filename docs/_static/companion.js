@@ -21,15 +21,39 @@ addEventListener("DOMContentLoaded", () => {
   }
 });
 
-// Tables: names may break after an underscore or a slash, and a cell of the claims knows its column's name.
+// Claims: a button for each verdict of ours shows the claims that have it, with their statements.
+addEventListener("DOMContentLoaded", () => {
+  const counts = document.querySelector('[id^="claims-of-"] > :not(section) table, [id^="claims-of-"] > table');
+  if (!counts) return;
+  const claims = [];
+  for (const row of document.querySelectorAll('[id^="claims-of-"] section:not(#records-and-commands) tbody tr')) {
+    const verdict = row.cells[1].querySelector("strong");
+    if (row.cells[0].querySelector("strong")) claims.push({ verdict: verdict.textContent.replace(/^\W+/, ""), rows: [] });
+    claims.at(-1).rows.push(row);
+  }
+  const bar = document.createElement("p");
+  const names = ["all", ...new Set([...counts.querySelectorAll("tbody tr")].map((row) => row.cells[0].textContent.trim()))];
+  for (const name of names.filter((one) => one === "all" || claims.some((claim) => claim.verdict === one))) {
+    const button = document.createElement("button");
+    button.className = "btn btn-sm btn-outline-primary me-1 mb-1";
+    button.textContent = name;
+    button.setAttribute("aria-pressed", name === "all");
+    button.addEventListener("click", () => {
+      for (const other of bar.children) other.setAttribute("aria-pressed", other === button);
+      for (const { verdict, rows } of claims) for (const row of rows) row.hidden = name !== "all" && name !== verdict;
+    });
+    bar.append(button);
+  }
+  bar.className = "verdicts";
+  bar.prepend("Ours: ");
+  counts.after(bar);
+});
+
+// Tables: names may break after an underscore or a slash.
 addEventListener("DOMContentLoaded", () => {
   for (const table of document.querySelectorAll(".bd-article table")) {
-    const names = [...table.querySelectorAll("thead th")].map((cell) => cell.textContent.trim());
+    const names = [...table.querySelectorAll("thead th")];
     for (const cell of table.querySelectorAll("th, td")) {
-      if (cell.matches("[id^=\"claims-of-\"] td") && names[cell.cellIndex]) {
-        cell.dataset.label = names[cell.cellIndex];
-        if (["", "–"].includes(cell.textContent.trim())) cell.dataset.empty = "";
-      }
       const walker = document.createTreeWalker(cell, NodeFilter.SHOW_TEXT);
       const texts = [];
       while (walker.nextNode()) texts.push(walker.currentNode);

@@ -13,9 +13,11 @@ looked at it and accepts the change on purpose (`--accept`).
 from __future__ import annotations
 
 import functools
+import html
 import inspect
 import json
 import logging
+import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -381,13 +383,69 @@ def statement_table(judgement: Judgement) -> pd.DataFrame:
     return found.reindex(list(says)).dropna(how="all").fillna("").rename(says).rename_axis("statement").reset_index()
 
 
+def _by_group(judgements: Sequence[Judgement]) -> dict[str, list[Judgement]]:
+    groups: dict[str, list[Judgement]] = {}
+    for each in judgements:
+        groups.setdefault(each.claim.group, []).append(each)
+    return groups
+
+
+def _short(statement: Statement | None) -> str:
+    """Return what was found of a statement, behind its mark; metrics that miss and models stay in `statement_table`."""
+    if statement is None or statement.verdict == judging.UNMEASURED:
+        return ""
+    return f"{_MARKS[statement.verdict]} {re.sub('; not: [^;]*| over [0-9]+ models [(].*?[)]', '', statement.figure)}"
+
+
+def _side(verdict: str, statements: Sequence[Statement], where: str = "") -> str:
+    """Return one side's verdict on a claim behind its mark, where it holds, and the first reason why it is none."""
+    mark, why = _MARKS.get(verdict, ""), next((f": {reason}" for one in statements for reason in one.reasons), "")
+    return f"**{f'{mark} {verdict}'.strip()}**{where}{why}"
+
+
+def claims_table(judgements: Sequence[Judgement]) -> str:
+    """Return claims as Markdown: two columns of verdicts, and below each claim its statements with their figures."""
+    rows = []
+    for each in judgements:
+        claim, on = each.claim, [name for name in (each.dataset, *each.times_of) if name in DATASET_ORDER[1:]]
+        where = f" ({', '.join(on)})" if on else ""
+        sides = (_side(each.verdict, each.ours, where), _side(each.paper_verdict, each.paper))
+        rows.append((f"**{claim.id}** {claim.text} ({claim.where})", *sides))
+        ours, paper = ({one.says: one for one in some} for some in (each.ours, each.paper))
+        found = ((one.says, _short(ours.get(one.says)), _short(paper.get(one.says))) for one in claim.statements)
+        rows += [row for row, one in zip(found, claim.statements, strict=True) if any(row[1:]) and not one.remark]
+    return compact_table(pd.DataFrame(rows, columns=["claim", "ours", "the paper's tables"]))
+
+
+def marks_picture(judgements: Sequence[Judgement]) -> str:
+    """Return all verdicts as an SVG: a panel a group, a line a claim, a mark by our records and one by the paper's."""
+    colors = read_toml(Path(__file__).with_name("claims_page.toml"))["colors"]
+    groups = _by_group(judgements)
+    width, height = 190 * len(groups), 50 + 22 * max(map(len, groups.values()))
+    write = lambda x, y, text, how="": f'<text x="{x}" y="{y}" {how}>{html.escape(text)}</text>'
+    drawn = [f'<rect width="{width}" height="{height}" fill="white"/>']
+    for panel, (group, some) in enumerate(groups.items()):
+        x = 10 + 190 * panel
+        drawn.append(write(x, 18, group, 'font-weight="bold"'))
+        drawn += [write(x + 40, 38, "ours"), write(x + 95, 38, "paper's")]
+        for row, each in enumerate(some):
+            drawn.append(write(x, 60 + 22 * row, each.claim.id))
+            for place, verdict in ((x + 40, each.verdict), (x + 95, each.paper_verdict)):
+                box = f'x="{place}" y="{45 + 22 * row}" width="40" height="20" fill="{colors[verdict]}"'
+                mark = write(place + 20, 60 + 22 * row, _MARKS.get(verdict, ""), 'text-anchor="middle"')
+                drawn.append(f"<rect {box}><title>{each.claim.id}: {verdict}</title></rect>{mark}")
+    shape = f'viewBox="0 0 {width} {height}" width="{width}" height="{height}"'
+    style = 'font-family="sans-serif" font-size="13"'
+    return "\n".join([f'<svg xmlns="http://www.w3.org/2000/svg" {shape} {style}>', *drawn, "</svg>", ""])
+
+
 def ledger_markdown(judgements: Sequence[Judgement]) -> str:
-    """Render the ledger of one paper as Markdown: counts, a table for each group, then every statement.
+    """Render the ledger of one paper as Markdown: picture, counts, a table a group, records and commands, rules last.
 
     Args:
       judgements: from `judge_claims`, at least one.
     """
-    frame, paper = ledger(judgements), judgements[0].claim.paper
+    paper = judgements[0].claim.paper
     texts = read_toml(Path(__file__).with_name("claims_page.toml"))
     about, words = load_paper_file("paper", paper), texts["page"] | load_paper_file("claims", paper).get("page", {})
     training = {"windows": {}, "says": "their number is not known"} | about.get("training", {})
@@ -395,30 +453,30 @@ def ledger_markdown(judgements: Sequence[Judgement]) -> str:
     seen = gpu.train_steps * gpu.batch_size
     share = 100.0 * seen / training["windows"].get("32", np.nan)
     fields = {"steps": gpu.train_steps, "batch": gpu.batch_size, "seen": seen / 1e6, "share": share}
-    fields |= {"windows": training["says"], "here": (here := scale(judgements))}
-    head = texts["head"].format(
-        count=len(load_claims(paper)), name=about["name"], setting=about["setting"], paper=paper,
-        marks=", ".join(f"{mark} {verdict}" for verdict, mark in _MARKS.items() if verdict),
-        here=here, **{key: text.strip().format(**fields) for key, text in words.items()},
-    )  # fmt: skip
-    counts = {here: frame["verdict"].value_counts(), "the paper's tables": frame["paper_verdict"].value_counts()}
-    counted = pd.DataFrame(counts, index=pd.Index(judging.VERDICTS, name="verdict")).fillna(0).astype(int)
-    parts = [head, markdown_table(counted.reset_index())]
-    frame[here] = frame["verdict"] + ": " + frame["ours"]
-    printed = frame["paper_verdict"] + ": " + frame["paper_figure"]
-    frame["the paper's tables"] = printed.where(frame["paper_verdict"] != judging.UNMEASURED, "no figures")
-    frame = frame.rename(columns={"id": "", "paper_says": "paper says", "dataset": "data set"})
-    short = frame[["", "claim", "where", here, "paper says", "the paper's tables", "data set", "hardware", "record"]]
-    parts += [f"## {group}\n\n{compact_table(rows)}" for group, rows in short.groupby(frame["group"], sort=False)]
-    parts.append("## Statement by statement\n")
-    for judgement in judgements:
-        claim = judgement.claim
-        typed = "\n".join(load_commands(paper)[claim.id])
-        parts.append(
-            f"### {claim.id} · {claim.text}\n\nPaper {claim.where}. Decided by {claim.decided_by}. Measured by"
-            f"\n\n```sh\n{typed}\n```\n\n{compact_table(statement_table(judgement))}"
-        )
-    return "\n".join(parts)
+    fields |= {"windows": training["says"], "here": scale(judgements)}
+    fields |= {key: text.strip().format(**fields) for key, text in words.items()}
+    fields |= {"count": len(load_claims(paper)), "name": about["name"], "setting": about["setting"], "paper": paper}
+    fields |= {"marks": ", ".join(f"{mark} {verdict}" for verdict, mark in _MARKS.items() if verdict)}
+    fields |= {"picture": ledger_path(paper).with_suffix(".svg").name}
+    verdicts = {"ours": [one.verdict for one in judgements]}
+    verdicts["the paper's tables"] = [one.paper_verdict for one in judgements]
+    counts = pd.DataFrame({side: pd.Series(some).value_counts() for side, some in verdicts.items()})
+    counts = counts.reindex(judging.VERDICTS).fillna(0).astype(int).rename_axis("verdict").reset_index()
+    records: dict[tuple[str, str], list[str]] = {}
+    for each in judgements:
+        places = [(one.place, one.hardware) for found in each.ours if each.dataset for one in found.sources]
+        for place in dict.fromkeys(places):
+            records.setdefault(place, []).append(each.claim.id)
+    looked = [{"record": place, "device": device, "claims": ", ".join(ids)} for (place, device), ids in records.items()]
+    typed = [f"# {', '.join(one['claims'])}\n{one['run']}" for one in load_paper_file("commands", paper)["command"]]
+    return "\n".join([
+        texts["head"].format(**fields),
+        markdown_table(counts),
+        *(f"## {group}\n\n{claims_table(some)}" for group, some in _by_group(judgements).items()),
+        f"## Records and commands\n\n{compact_table(pd.DataFrame(looked))}",
+        "```sh", *typed, "```",
+        texts["tail"].format(**fields),
+    ])  # fmt: skip
 
 
 def ledger_path(paper: str = "f3amd") -> Path:
@@ -477,6 +535,7 @@ def write_ledger(path: Path, judgements: Sequence[Judgement], *, accept: bool = 
     changes = changed_verdicts(frame, accepted_verdicts(path))
     if accept or not changes:
         write_whole(path, ledger_markdown(judgements))
+        write_whole(path.with_suffix(".svg"), marks_picture(judgements))
         kept = json.dumps(_verdicts(frame), indent=2, ensure_ascii=False)
         write_whole(path.with_suffix(".json"), f"{kept}\n")
     return changes
