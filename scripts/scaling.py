@@ -1,6 +1,6 @@
 """What 1, 8 and 100 machines bring to the long queue, by arithmetic from measured costs.
 
-    python scripts/scaling.py        # writes the tables of docs/scaling.md
+    python scripts/scaling.py        # writes tables of docs/training.md
 
 Costs come from records: seconds a training step (`training_time.csv`) and seconds a measurement
 (`quality_by_seed.csv`). Machines take legs as `f3amd sweep` does: the first of the plan that may
@@ -28,7 +28,7 @@ from f3amd_lib.networks import presets
 
 ROOT = Path(__file__).resolve().parents[1]
 RECORDS = ROOT / "paper_figures"
-PAGE = ROOT / "docs" / "scaling.md"
+PAGE = ROOT / "docs" / "training.md"
 MACHINES = (1, 2, 4, 8, 100)
 BYTES_OF_STATE = 16
 """Of a parameter in a training state: itself, its moving average, Adam's two; float32."""
