@@ -104,8 +104,8 @@ class Person:
     """How BVH files of others are read.
 
     Attributes:
-      scale: metres in a unit of the file, instead of what its legs tell.
-      up: axis that is up in the file, Y or Z, instead of what legs and hips tell.
+      scale: metres in a unit of the file, instead of a guess by its legs.
+      up: axis that is up in the file, Y or Z, instead of a guess by legs and hips.
       joint_map: TOML file of lines such as left_knee = "calf_l": which joint plays a role, where it is not found.
     """
 
@@ -144,7 +144,7 @@ class People(Person):
 
 @dataclass(frozen=True)
 class Data:
-    """Motion, and how much is done with it.
+    """Motion, and how much is computed.
 
     Attributes:
       data: synthetic, bandai, 100style or folder.
@@ -179,7 +179,7 @@ class Model:
       sampler: ddim, ddpm, euler or heun; by default the model's own.
       data: use the model of this data set.
       weights: a weights file, instead of the data set's own.
-      overwrite: replace what lies there.
+      overwrite: replace existing files.
     """
 
     steps: int = 8
@@ -202,7 +202,7 @@ class Model:
             with safetensors.safe_open(self.file, framework="numpy") as file:
                 return list(json.loads(file.metadata()["description"])["styles"])
         except (safetensors.SafetensorError, OSError, LookupError, TypeError, ValueError):
-            raise ValueError(f"{self.file}: no whole file of a model with styles") from None
+            raise ValueError(f"{self.file}: not a complete model with styles; restore a whole copy") from None
 
     def style(self, asked: str) -> str:
         """Return a style as the model has it, whatever its case; ValueError names the nearest if there is none."""
@@ -254,7 +254,7 @@ def joints(file: Positional[Path], person: Person) -> None:
 
 
 def data(motion: Data) -> None:
-    """Open a data set, build its packed cache, say what is in it."""
+    """Open a data set, build its packed cache and describe it."""
     packed = motion.open()[0].packed
     splits = packed.clip_split.tolist()
     split = ", ".join(f"{splits.count(number)} {name}" for number, name in enumerate(sources.SPLITS))
@@ -275,7 +275,7 @@ def dataset(
       source: folder or zip of BVH files.
       data: another data set instead of a folder: synthetic, bandai, 100style.
       fps: frames per second to write.
-      out: folder to write to; must be empty or not there yet.
+      out: folder to write to; must be empty or new.
     """
     terminal.check_there(captions, source)
     terminal.check_writable(out)
@@ -324,14 +324,14 @@ def train(
     batch_size: int | None = None, seed: int | None = None, out: Path | None = None, all_devices: bool = False,
     teacher: Path | None = None, captions: Encoder = Encoder(),
 ) -> int:  # fmt: skip
-    """Train a model; a killed run goes on where it stopped.
+    """Train a model; a killed run continues where it stopped.
 
     Args:
       preset: such as F3AMD-FNO-96; by default the profile's; repeatable, trained in this order. Of text to motion
         (--data bandai) such as ACMDM-S-PS22-raw-n3; NAME+control its control branch, NAME+control-pelvis one that
         knows the pelvis alone; judge the judge;
         MotionPCM-M1-small and so on a student, with the autoencoder and the teacher before it.
-      minutes: stop then, with a checkpoint that a later call goes on from, and exit status 3.
+      minutes: stop after these with a checkpoint and exit status 3; the same command continues.
       steps: optimiser steps; by default the profile's.
       batch_size: windows a step.
       seed: of weights, batches and noise.
@@ -396,9 +396,9 @@ def rollout(
       seed: of path and noise.
       seconds: length of a named path; a CSV has its own.
       speed: of a named path, m/s; a CSV has its own.
-      raw: as the network made it: seams are not blended (over 4 frames), feet not held where they stand.
+      raw: as the network made it: seams are not blended (over 4 frames), supporting feet not held.
       format: of the motion: bvh, glb (glTF with a body), csv or gif (its first 12 s); several with commas between.
-      start: a BVH file to go on from: its last frames are the history; another humanoid's are retargeted.
+      start: a BVH file to continue: its last frames are the history; another humanoid is retargeted.
       out: folder to write to.
     """
     style, seed, drawn, history = model.style(style), checked_seed(seed), path.lower().endswith(".csv"), None
@@ -448,27 +448,27 @@ def text(
     seed: int = 0, control: Path | None = None, joint: str = "pelvis", any_words: bool = False,
     text_weights: Path | None = None, format: str = "bvh", overwrite: bool = False, out: Path = Path("out"),
 ) -> None:  # fmt: skip
-    """Animate what a caption tells: motion, film strip, player.
+    """Animate a caption: motion, film strip, player.
 
     Args:
       caption: such as "an elderly person raises the left hand".
-      then: what the person does after that, without a stop; repeatable. Needs a model of the prefix form.
+      then: what the person does next, without a stop; repeatable. Needs a model of the prefix form.
       model: a preset, such as ACMDM-S-PS22-raw-n3; by default the newest of ACMDM's that is trained.
         motionpcm stands for its small student of so many --steps, MotionPCM-M1-small by default.
       data: the data set that it was trained on.
       weights: a weights file instead.
       seconds: of each caption.
-      guidance: how hard the caption pushes; by default the model's own, else the paper's 3 (control 2.5, a stream 4).
+      guidance: strength of the caption; by default the model's own, else the paper's 3 (control 2.5, a stream 4).
         MotionPCM counts from 0, not from 1: 14, of a student between 5 and 15; its teacher 6.5.
       steps: of Euler's method; by default the model's own sampler, which may choose its steps itself. A student of
         MotionPCM takes 1, 2 or 4, as it was trained for, its teacher (MotionPCM-teacher-small) any number.
       seed: of the noise.
       control: CSV with the header frame,x,y,z: where a joint should be, frames from 0, metres. Needs a control branch.
-      joint: that is controlled: pelvis, left_foot, right_foot, head, left_wrist or right_wrist.
-      any_words: take words, too, that no caption of the training had.
+      joint: the controlled joint: pelvis, left_foot, right_foot, head, left_wrist or right_wrist.
+      any_words: allow words that are in no training caption.
       text_weights: folder of CLIP or Sentence-T5, for a model that was trained with one of them.
       format: of the motion: bvh, glb (glTF with a body), csv or gif (its first 12 s); several with commas between.
-      overwrite: replace what lies there.
+      overwrite: replace existing files.
       out: folder to write to.
     """
     captions, seed = [caption, *then], checked_seed(seed)
@@ -486,9 +486,9 @@ def text(
     how = {"seconds": seconds, "seed": seed, "guidance": guidance, "num_steps": steps, "any_words": any_words}
     made = captioned_motion.animate(trained, encoder, captions, control=control, joint=joint, **how)
     far = lambda metres: f"{100 * metres.mean():.1f} cm on average, {100 * metres.max():.1f} cm at most"
-    log.info("bones        joints moved by %s, so that bones keep their lengths", far(made.moved))
+    log.info("bones        lengths corrected: joints moved by %s", far(made.moved))
     if control is not None:
-        log.info("control      %s is away by %s", joint, far(made.missed))
+        log.info("control      %s misses its path by %s", joint, far(made.missed))
     shown = player.Character(made.motion, name=name)
     scene = player.Scene([shown], title=made.motion.name, boundaries=made.boundaries)
     _write_shown(targets, scene, trained)
@@ -514,7 +514,7 @@ def crowd(
     chunk: int | None = None, plan: Annotated[tuple[float, ...] | None, tyro.conf.arg(metavar="[METRES]")] = None,
     pictures: bool = False, format: str | None = None, raw: bool = False, out: Path = Path("out/crowd"),
 ) -> None:  # fmt: skip
-    """Animate any number of characters, streamed to a folder; goes on where it was stopped.
+    """Animate any number of characters, streamed to a folder; a stopped run continues.
 
     Args:
       characters: how many.
@@ -525,7 +525,7 @@ def crowd(
       plan: paths that keep this far apart at every frame, 0.8 without a number.
       pictures: draw OUT.png and the player page OUT.html as well, with seams blended and feet held.
       format: write everybody to OUT_motions/, too, finished like the pictures: bvh, glb or csv; several with commas.
-      raw: draw and write them as the network made them; the folder holds that in any case.
+      raw: draw and write them as the network made them; the folder always holds this.
       out: folder to write to.
     """
     if plan is not None and len(plan) > 1:
@@ -571,7 +571,7 @@ def export(
     how = {"num_steps": model.steps, "overwrite": model.overwrite}
     if "onnx" in target:
         if len(target) > 1 or model.sampler:
-            raise ValueError("--target onnx goes alone, and without --sampler: what is exported is one evaluation")
+            raise ValueError("--target onnx exports one evaluation: leave out other targets and --sampler")
         trained = (model.weights and onnx_export.load_text_or_latent(model.weights)) or model.load()
         made = onnx_export.export_onnx(trained, out, batch=characters, weights=stored, **how)
     else:
@@ -601,12 +601,12 @@ def bench(
     motion: Data, suite: Repeatable = (), characters: UseAppendAction[tuple[int, ...]] = (), again: bool = False,
     training: bool = False, parts: bool = False,
 ) -> int:  # fmt: skip
-    """Time synthesis and training, write records, compare with what is asked; exit status 1 where a bar is missed.
+    """Time synthesis and training, write records, compare with our bars; exit status 1 where a bar is missed.
 
     Args:
       suite: smoke, bars, main, family, windows, curve or gpu; repeatable; by default the profile's.
       characters: these numbers only; repeatable.
-      again: time anew what is in the table.
+      again: measure again what is in the table.
       training: time training steps (Table 2).
       parts: time a round without each part.
     """
@@ -641,7 +641,7 @@ def measure(
         text_guidance, text_one_caption, by name alone.
       model: this preset; repeatable.
       published: CAMDM's published weights as safetensors, one more row of quality.
-      minutes: of text to motion: stop then; a later call goes on, and the exit status is 3.
+      minutes: of text to motion: stop after these with exit status 3; the same command continues.
       plan: of text to motion: queue trains each row to several lengths, and compared ones with several seeds (hours to
         days); all of its tables, in its order, if none is named.
       packed: of text to motion: all clips of bandai as their packed cache file, instead of their source.
@@ -651,7 +651,7 @@ def measure(
         check_known(name, [*measuring.MEASUREMENTS, *text_tables.TEXT_MEASUREMENTS], "measurement")
     if of_text := [name for name in names if name in text_tables.TEXT_MEASUREMENTS]:
         if len(of_text) < len(names):
-            raise ValueError(f"{', '.join(of_text)}: measure text to motion by a call of its own")
+            raise ValueError(f"{', '.join(of_text)}: measure text to motion in a separate call")
         profile, how = motion.numbers(), {"models": model, "stop_at": _stop_at(minutes)}
         clips = text_motions.bandai_text_motions(packed_data.load_packed(packed)) if packed else None
         given = clips or text_models.open_text_motions(motion.data, motion.source), captions.load(), profile
@@ -679,11 +679,11 @@ def campaign(
     packed: Path | None = None, times: bool = False, precision: str = "float32", out: Path | None = None,
     queue: str = "campaign", package: str | None = None, measure: bool = False,
 ) -> int:  # fmt: skip
-    """Train and measure the long queue of real motion in legs; a killed leg goes on where it stopped.
+    """Train and measure the queue of real motion; a stopped run continues.
 
     Args:
-      minutes: stop then, with a checkpoint that a later call goes on from, and exit status 3; a measurement that is
-        under way is finished.
+      minutes: stop after these with a checkpoint and exit status 3; the same command continues. A running measurement
+        is finished.
       batch_size: windows a step; the paper's is 512.
       only: this preset, recipe or run of the queue; repeatable.
       packed: the data set as its packed cache file, instead of its source.
@@ -693,7 +693,7 @@ def campaign(
       out: folder for states and weights instead of runs/DATA/PROFILE/campaign.
       queue: campaign, or readings: which reading of the paper behaves like the paper?
       package: train this package of papers/f3amd/gpu_plan.toml and keep its weights, unmeasured, for a GPU.
-      measure: measure the weights of a package that lie in the folder, and train nothing.
+      measure: measure a package's weights in the folder, and train nothing.
     """
     stop_at = _stop_at(minutes)
     if times:
@@ -729,7 +729,7 @@ def sweep(
     names: Positional[tuple[str, ...]] = (), *, motion: Data, preset: Repeatable = (), workers: int = 2,
     scheduler: str | None = None, queue: Path | None = None, batch_size: int = 128, out: Path | None = None,
 ) -> int:  # fmt: skip
-    """Do the long queue, or measurements of presets, in several processes; a dead worker costs only its leg.
+    """Run the queue, or measurements of presets, in several processes; a dead worker costs only its task.
 
     Args:
       names: campaign, or measurements such as quality, walking; a leg each for every preset.
@@ -742,7 +742,7 @@ def sweep(
     """
     profile = motion.numbers()
     if motion.window not in (None, profile.window) or motion.people != People():
-        raise ValueError("--window is for f3amd measure alone, and how a folder is read for one process")
+        raise ValueError("leave out --window and how a folder is read: several processes do not take them")
     folder = (out or runs_dir(profile.dataset, profile.name)).resolve()
     results = results_dir(profile.dataset, profile.name).resolve()
     work = engine.Work(profile, motion.source, results.parents[1], folder, batch_size)
@@ -799,7 +799,7 @@ def claims(accept: bool = False, paper: str | None = None) -> int:
     """Judge the papers' claims from records; writes paper_figures/claims.md and claims_<paper>.md.
 
     Args:
-      accept: take changed verdicts for right and write them down.
+      accept: accept changed verdicts and write them.
       paper: whose claims, such as acmdm; each paper's if none.
     """
     return ledger.main(accept, paper)
@@ -828,14 +828,14 @@ def convert(
       text_weights: folder of what embeds captions: CLIP, Sentence-T5, an evaluator's GloVe files.
       source: folder in HumanML3D's layout, whose words have the tags that an evaluator reads.
       layout: of the skeleton: humanml3d or kit.
-      overwrite: replace what lies there.
+      overwrite: replace existing files.
       out: folder to write to.
     """
     target = out / f"{to}.safetensors"
     terminal.check_there(weights, statistics, autoencoder, text_weights, source)
     terminal.check_free([target, target.with_suffix(".md")], overwrite)
     if family == "camdm":
-        raise ValueError("CAMDM's weights walk as they are: f3amd measure quality --published")
+        raise ValueError("CAMDM's weights need no conversion: f3amd measure quality --published FILE")
     options = {"preset": preset, "statistics": statistics, "autoencoder": autoencoder, "layout": layout}
     encoder = released.released_encoder(family, text_weights, source)
     trained = _say_model(released.read_released(weights, family, encoder=encoder, **options))
@@ -865,7 +865,7 @@ def reproduce(
       windows: for f3amd how many are trained on, instead of 100 epochs.
       batch_size: of that training.
       profile: for f3amd gpu, laptop or smoke.
-      minutes: stop then; a later call goes on, and the exit status is 3.
+      minutes: stop after these with exit status 3; the same command continues.
       seed: of captions, crops and noise.
       out: folder of the records instead of runs/.
     """
@@ -891,7 +891,7 @@ def reproduce(
 
 
 def _say_reproduced(paths: Sequence[Path] | None) -> int:
-    """Show tables beside the paper's; return the exit status, of None that of an unfinished run."""
+    """Show tables beside the paper's; return the exit status, of None the status of an unfinished run."""
     for path in paths or ():
         log.info("\n%s\n", tables.markdown_table(records.read_table(path)[0], digits=3))
         _say_written(path)
@@ -908,7 +908,7 @@ COMMANDS = (
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command; what the user has to mend ends with one line and status 2."""
+    """Run a command; errors that the user can fix end with one line and status 2."""
     logging.basicConfig(format="%(message)s", stream=sys.stdout)  # of others' logs, warnings
     terminal.set_environment()
     given = sys.argv[1:] if argv is None else list(argv)
@@ -942,7 +942,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"\n{stopped}", file=sys.stderr)
         return 130
     if status == UNFINISHED:
-        log.info("unfinished   this goes on with it: f3amd %s", shlex.join(given))
+        log.info("unfinished   to continue: f3amd %s", shlex.join(given))
     return status or 0
 
 

@@ -1,4 +1,4 @@
-"""Manners of the command line: what is refused before JAX is loaded, how progress is shown, how Ctrl-C ends."""
+"""The command line before and around JAX: cheap checks, plain progress, Ctrl-C."""
 
 import functools
 import logging
@@ -15,9 +15,9 @@ log = logging.getLogger("f3amd")
 
 
 def set_environment() -> None:
-    """Tell matplotlib and JAX, before they are loaded, what the user has not told them otherwise."""
+    """Set defaults of matplotlib and JAX before they are loaded, unless the user has set them."""
     os.environ.setdefault("MPLBACKEND", "Agg")
-    # JAX multiplies in tf32 on a GPU, with 10 bits of mantissa, where nothing else is said.
+    # By default JAX multiplies in tf32 on a GPU, with 10 bits of mantissa.
     os.environ.setdefault("JAX_DEFAULT_MATMUL_PRECISION", "float32")
     cache = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(cache, "f3amd/jax").expanduser()))
@@ -25,14 +25,14 @@ def set_environment() -> None:
 
 
 def check_there(*files: Path | str | None) -> None:
-    """Raise ValueError if one of the files that are asked for is not there."""
+    """Raise ValueError if one of the given files does not exist."""
     for file in files:
         if file is not None and not Path(file).exists():
             raise ValueError(f"{file}: no such file or folder")
 
 
 def check_writable(*targets: Path) -> None:
-    """Raise ValueError if one of the files or folders could not be made."""
+    """Raise ValueError if one of the files or folders cannot be created."""
     for target in targets:
         folder = next(folder for folder in target.absolute().parents if folder.exists())
         try:
@@ -43,7 +43,7 @@ def check_writable(*targets: Path) -> None:
 
 
 def check_free(targets: Sequence[Path], overwrite: bool) -> None:
-    """Raise ValueError if one of the files could not be made, or is there and may not be replaced."""
+    """Raise ValueError if one of the files cannot be created, or exists and may not be replaced."""
     taken = [str(target) for target in targets if target.exists()]
     if taken and not overwrite:
         raise ValueError(f"{', '.join(taken)}: exists already; pass --overwrite or another --out")
@@ -51,7 +51,7 @@ def check_free(targets: Sequence[Path], overwrite: bool) -> None:
 
 
 def show_plainly(quiet: bool) -> None:
-    """Let bars of progress be lines, one in ten seconds, where no terminal shows them; none if quiet."""
+    """Show progress as plain lines, one every ten seconds, where there is no terminal; none if quiet."""
     log.setLevel(logging.WARNING if quiet else logging.INFO)
     if quiet or not sys.stderr.isatty():
         from tqdm import tqdm
@@ -60,7 +60,7 @@ def show_plainly(quiet: bool) -> None:
 
 
 class Lines:
-    """What tqdm writes to: of the states of a bar, it shows one in ten seconds and the last."""
+    """A stream for tqdm that prints the state of a bar every ten seconds, and the last one."""
 
     def __init__(self, quiet: bool):
         self.quiet, self.line, self.shown, self.due = quiet, "", "", 0.0
@@ -79,15 +79,15 @@ class Lines:
 
 
 def leave(says: str) -> None:
-    """End with status 130, without the farewell that JAX's threads take for a crash."""
+    """Exit with status 130 at once: a normal exit can crash JAX's threads."""
     print(f"\n{says}", file=sys.stderr, flush=True)
     os._exit(130)
 
 
 def leave_on_ctrl_c(says: str, at_once: bool) -> None:
-    """End within a second of Ctrl-C: while compiled code runs, Python itself hears of it only afterwards.
+    """Exit within a second of Ctrl-C, also while compiled code runs and Python sees no signal.
 
-    At once, where nothing is to be put in order: a KeyboardInterrupt while libraries are loaded can be a crash.
+    At once where nothing needs cleaning up: a KeyboardInterrupt while libraries are loaded can crash.
     """
     if at_once:
         signal.signal(signal.SIGINT, lambda *_: leave(says))
@@ -98,7 +98,7 @@ def leave_on_ctrl_c(says: str, at_once: bool) -> None:
     def watch() -> None:
         while os.read(reading, 1)[0] != signal.SIGINT:
             pass
-        time.sleep(0.6)  # what can be put in order in Python has this long
+        time.sleep(0.6)  # time for Python's own cleaning up
         leave(says)
 
     threading.Thread(target=watch, daemon=True).start()

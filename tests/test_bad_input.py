@@ -119,7 +119,7 @@ def test_a_single_file_is_no_data_set(tmp_path, monkeypatch):
     file.write_text(TEXT)
     monkeypatch.setenv(sources.DATA_DIR_VARIABLE, str(file))
     for name in ("folder", "bandai"):
-        refused("walk.bvh: is a single file; name the folder", open_dataset, name)
+        refused("walk.bvh: is a single file; give its folder", open_dataset, name)
 
 
 # -------------------------------------------------------------------------------- caches and weights

@@ -102,7 +102,7 @@ def test_a_rollout_is_blended_only_if_asked(generator, plain):
     keep = np.arange(3 * WINDOW) % WINDOW >= 4
     np.testing.assert_allclose(blended.frames[:, keep], plain.frames[:, keep], atol=1e-6)
     assert np.abs(blended.frames - plain.frames).max() > 1e-3
-    refused("blended already", blend_rollout, blended, 4)
+    refused("already blended", blend_rollout, blended, 4)
 
 
 @pytest.mark.parametrize(

@@ -199,7 +199,7 @@ BROKEN = {
     "ends after MOTION": (lambda text: text[: text.index("Frames")], 22, "found 'the end of the file'"),
     "two ROOTs": (swap("}\n\nMOTION", "}\nROOT Twin\n{\n}\nMOTION"), 21, "second ROOT .*'Base' in l"),
     "missing brace": (swap("}\n\nMOTION", "\n\nMOTION"), 22, "'{' of 'Base' .line 2. is still"),
-    "brace too many": (swap("}\n\nMOTION", "}\n}\nMOTION"), 21, "'}' stands outside"),
+    "brace too many": (swap("}\n\nMOTION", "}\n}\nMOTION"), 21, "'}' is outside"),
     "joint without brace": (swap("Elbow\n  {", "Elbow\n"), 6, "JOINT needs a name .* '{', found 'Elbow"),
     "unknown channel": (
         swap("Xrotation", "Wrotation"),

@@ -83,7 +83,7 @@ def test_fifteen_joints_are_seen_of_whichever_rig_and_all_are_needed():
     shown = [classifier_frames(rig.rest_positions[None], rig) for rig in (BANDAI, SYNTHETIC_SKELETON)]
     assert [frames.shape for frames in shown] == [(1, NUM_CHANNELS)] * 2
     less = Skeleton(["toy"] + [f"bone {n}" for n in range(20)], BANDAI.parents, np.zeros((21, 3)))
-    refused("no joint is known as its", classifier_frames, np.zeros((1, 21, 3)), less)
+    refused("no joint has the role", classifier_frames, np.zeros((1, 21, 3)), less)
 
 
 def figure(hips_yaw=0.0, collar_yaw=0.0) -> np.ndarray:

@@ -292,7 +292,7 @@ def test_a_start_is_corrected_before_it_is_retargeted(weights, tmp_path, caplog,
     words = ["rollout", "--weights", weights, "--style", "proud", "--out", str(tmp_path), "--start", str(file)]
     with caplog.at_level("INFO", logger="f3amd"):
         assert main(words) == 2  # the tiny model is no person
-    assert "walk.bvh: read in metres" in caplog.text and "no joint is known as" in capsys.readouterr().err
+    assert "walk.bvh: read in metres" in caplog.text and "no joint has the role" in capsys.readouterr().err
     assert main([*words, "--scale", "1e-3"]) == main([*words, "--joint-map", str(tmp_path / "none.toml")]) == 2
     assert "none.toml" in capsys.readouterr().err
 

@@ -95,7 +95,7 @@ def test_a_student_is_asked_in_the_units_of_its_teacher(tmp_path, monkeypatch):
 
 def test_phases_that_no_sampler_visits_are_refused(task):
     for number in (3, 2):
-        with pytest.raises(ValueError, match=f"not the edges of {number} phases"):
+        with pytest.raises(ValueError, match=f"into {number} equal phases"):
             dataclasses.replace(task, num_phases=number)
 
 

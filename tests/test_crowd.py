@@ -278,11 +278,11 @@ def stop_after(still, chunks):
 def test_folders_with_other_things_are_left_alone(still, tmp_path):
     (tmp_path / "thesis.txt").write_text("years of work")
     for overwrite in (False, True):
-        refused("holds something else", generate_crowd, still, 2, 5, tmp_path, overwrite=overwrite)
+        refused("holds other files", generate_crowd, still, 2, 5, tmp_path, overwrite=overwrite)
     (tmp_path / "crowd.json").write_text('{"format": "ours", "num_finished": 0}')
     for overwrite in (False, True):
         refused(r"crowd.json: not written by this", generate_crowd, still, 2, 5, tmp_path, overwrite=overwrite)
-    refused("thesis.txt: holds something else", generate_crowd, still, 2, 5, tmp_path / "thesis.txt")
+    refused("thesis.txt: holds other files", generate_crowd, still, 2, 5, tmp_path / "thesis.txt")
     assert sorted(item.name for item in tmp_path.iterdir()) == ["crowd.json", "thesis.txt"]
     assert (tmp_path / "thesis.txt").read_text() == "years of work"
 

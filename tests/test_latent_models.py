@@ -323,7 +323,7 @@ def test_a_student_is_trained_by_name_with_all_before_it(data, tmp_path, monkeyp
     assert not np.array_equal(draw(teacher, num_steps=1), draw(teacher, num_steps=3))
     with pytest.raises(ValueError, match="tiny-M2 takes 2 steps, got 1"):
         draw(made, num_steps=1)
-    with pytest.raises(ValueError, match="an autoencoder alone"):
+    with pytest.raises(ValueError, match="only an autoencoder"):
         draw(load_text_model(files["tiny-VAE"]))
     with pytest.raises(ValueError, match="makes up to 40 frames, got 44"):
         latent_motions(made, text, 44, key)

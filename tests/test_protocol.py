@@ -281,7 +281,7 @@ def test_a_clip_shorter_than_the_classifiers_window_is_left_out(classifier):
 @pytest.mark.slow
 def test_too_few_windows_and_unknown_styles_are_refused(packed, classifier):
     many = dataclasses.replace(SMALL, windows_per_style=1000)
-    refused("1000 windows of style", measure_real, packed, classifier, many, window=32)
+    refused("1000 are needed", measure_real, packed, classifier, many, window=32)
     # One rollout of 96 frames holds 4 windows of 20; half the held-out clips hold 6.
     assert windows_that_fit(packed, classifier, many, window=32) == 4
     short = dataclasses.replace(many, num_frames=19)

@@ -62,7 +62,7 @@ def test_losses_of_several_readings_add_up_and_the_same_one_twice_is_refused():
     centimetres = {"position": 1e4, "joint_velocity": 1e4, "foot": 1e4, "ird": 1e2}
     assert recipe.loss == {"raw_features": True, **centimetres}
     for twice in ("geometry-in-centimetres+no-IRD", "CAMDM-units+CAMDM-units"):
-        with pytest.raises(ValueError, match="the same thing"):
+        with pytest.raises(ValueError, match="the same setting"):
             find_recipe(twice)
 
 

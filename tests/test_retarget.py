@@ -116,8 +116,8 @@ def test_a_rig_that_says_nothing_of_up_at_rest_is_put_upright_by_its_motion(band
 
 
 def test_who_lacks_joints_is_told_which(walk):
-    refused("no joint is known as neck, head.*left_knee", retarget, wandering_motion(5), walk)
-    refused("'wandering 0': no joint is known as", retarget, walk, wandering_motion(5))
+    refused("no joint has the role neck, head.*left_knee", retarget, wandering_motion(5), walk)
+    refused("'wandering 0': no joint has the role", retarget, walk, wandering_motion(5))
     assert BANDAI.num_joints == len(joint_roles(BANDAI))
 
 

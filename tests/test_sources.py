@@ -127,7 +127,7 @@ def test_folder_of_bvh(tmp_path, monkeypatch, no_network):
     (tmp_path / "happy" / "a.bvh").write_text(line_bvh(50, step_cm=2.0, frame_time="0.0333333"))
     assert open_dataset("folder").fingerprint != dataset.fingerprint
     # The data set opened before knows that its file is no longer the same.
-    refused(r"a\.bvh: is not the file that it should be", again.clips[0].load)
+    refused(r"a\.bvh: is not the expected file", again.clips[0].load)
 
 
 def test_folder_needs_a_place_and_files(tmp_path, monkeypatch):
@@ -280,7 +280,7 @@ def test_100style_missing_files_are_reported(tmp_path):
     [
         ("Frame_Cuts.csv", "21,181", "181,21", r"line 2: FW of Aeroplane has the range '181' to '21'"),
         ("Frame_Cuts.csv", "21,181", "21,N/A", r"line 2: FW of Aeroplane has the range '21' to 'nan'"),
-        ("Frame_Cuts.csv", "STYLE_NAME", "STYLE", "is not the table that it should be .*STYLE_NAME"),
+        ("Frame_Cuts.csv", "STYLE_NAME", "STYLE", "is not the expected table .*STYLE_NAME"),
     ],
 )
 def test_100style_broken_tables(tmp_path, table, old, new, message):
@@ -397,7 +397,7 @@ def test_bandai_refuses_a_tampered_file_by_name(small_bandai, tmp_path):
     zipped = zip_folder(small_bandai, tmp_path / "bandai_namco.zip")
     for place in (small_bandai, zipped):
         clip = next(clip for clip in open_dataset("bandai", path=place).clips if clip.name.endswith("normal_002"))
-        refused(r"normal_002\.bvh: is not the file that it should be", clip.load)
+        refused(r"normal_002\.bvh: is not the expected file", clip.load)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.7, 0.999])

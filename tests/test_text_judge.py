@@ -128,7 +128,7 @@ def test_what_cannot_be_judged_is_refused(judge, data, cache_dir):
     real = text_judge.judged_clips(data)
     other = OneVectorAWord()
     other.identity = "another"
-    with pytest.raises(ValueError, match="under 1.1: the judge does not see; train it longer"):
+    with pytest.raises(ValueError, match="under 1.1: this judge is too weak; train it longer"):
         text_judge.judge_motions(judge, OneVectorAWord(), real, {}, repeats=1, group=4, bar=1.1)
     with pytest.raises(ValueError, match="reads captions of one vector a word"):
         text_judge.judge_motions(judge, other, real, {}, repeats=1, bar=0.0)

@@ -198,7 +198,7 @@ def read_claims(about: Mapping, paper: str, where: str) -> dict[str, Claim]:
         here = f"{where}, claim {entry.get('id')}"
         check_entry(entry, here, ("id", "text", "where", "decided_by", "statement"), ("paper_says", "computed"))
         if entry["id"] in claims or entry["id"][0] not in about["groups"]:
-            raise ValueError(f"{here}: needs an id of its own that begins with one of {', '.join(about['groups'])}")
+            raise ValueError(f"{here}: needs a unique id that begins with one of {', '.join(about['groups'])}")
         fields = {key: value for key, value in entry.items() if key != "statement"}
         fields["statements"] = tuple(_read_statement(statement, about, here) for statement in entry["statement"])
         claims[entry["id"]] = Claim(paper, about["groups"][entry["id"][0]], **fields)
@@ -526,7 +526,7 @@ def write_ledger(path: Path, judgements: Sequence[Judgement], *, accept: bool = 
     Args:
       path: where to, ending in .md. The accepted verdicts lie beside it as JSON.
       judgements: from `judge_claims`.
-      accept: take changed verdicts for right and write them down.
+      accept: accept changed verdicts and write them.
 
     Returns:
       What changed, as from `changed_verdicts`. Without `accept` a change leaves both files alone.
@@ -545,7 +545,7 @@ def main(accept: bool = False, paper: str | None = None) -> int:
     """Judge the papers' claims from records; writes paper_figures/claims.md and claims_<paper>.md.
 
     Args:
-      accept: take changed verdicts for right and write them down.
+      accept: accept changed verdicts and write them.
       paper: whose claims; each paper's if none.
 
     Returns:
@@ -556,14 +556,14 @@ def main(accept: bool = False, paper: str | None = None) -> int:
     """
     status, folder = 0, ledger_path().parent
     if not folder.is_dir():
-        raise ValueError(f"{folder}: no records lie there; run this in a clone of the repository")
+        raise ValueError(f"{folder}: has no records; run this in a clone of the repository")
     for name in [paper] if paper else [name for name in paper_folders() if has_paper_file("claims", name)]:
         path = ledger_path(name)
         changes = write_ledger(path, judge_claims(paper=name), accept=accept)
         for change in changes:
             log.info("%s", change)
         if changes and not accept:
-            log.error("Nothing was written. If these are right: --accept")
+            log.error("Nothing was written. If these verdicts are right: --accept")
             status = 1
         else:
             log.info("%s is up to date", path.relative_to(repository_root()))

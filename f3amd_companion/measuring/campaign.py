@@ -146,7 +146,7 @@ def find_recipe(name: str) -> Recipe:
     together = {part: dict(ChainMap(*some)) for part, some in changes.items()}
     clash = any(len(together[part]) < sum(map(len, some)) for part, some in changes.items())
     if clash or len({row.preset for row in rows}) > 1:
-        raise ValueError(f"{name}: these recipes change the same thing, or start from unlike networks; ask for each")
+        raise ValueError(f"{name}: these recipes change the same setting, or different networks; name one of them")
     words = [", ".join(getattr(row, field) for row in rows) for field in ("change", "source")]
     return Recipe(name, *words, rows[0].preset, **together)
 

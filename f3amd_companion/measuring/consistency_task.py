@@ -63,7 +63,7 @@ class ConsistencyTask(Task):
         steps, phases, diffusion = self.num_teacher_steps, self.num_phases, self.denoising.config.diffusion
         visited, edges = diffusion.grid(phases, STUDENT_SPACING), diffusion.grid(steps)[:: max(1, steps // phases)]
         if visited.shape != edges.shape or not np.allclose(visited, edges):
-            raise ValueError(f"{phases} steps visit not the edges of {phases} phases of a walk of {steps}: take 1")
+            raise ValueError(f"{steps} steps cannot be cut into {phases} equal phases: take 1")
 
     @property
     def config(self):

@@ -312,7 +312,7 @@ def measure_sensitivity(prepared: PreparedData, profile: Profile, models: Iterab
       ValueError: if models are named.
     """
     if models:
-        raise ValueError("the metrics are asked about real motion: leave --model out")
+        raise ValueError("this measures metrics on real motion: leave --model out")
     classifier, protocol, record = protocol_of(prepared, profile, "sensitivity")
     graded = sensitivity.graded_corruptions(prepared.packed, classifier, protocol, progress=True)
     folder = records_folder(profile)

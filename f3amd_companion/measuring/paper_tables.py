@@ -298,7 +298,7 @@ def reproduce_table(
     data = read_humanml3d(given.data)
     layout = "kit" if data.skeleton.num_joints == 21 else "humanml3d"
     if (layout == "kit") != (name == "text_tableA3") and paper == "acmdm":
-        raise ValueError(f"{given.data}: is in the layout {layout}; ACMDM's Table A3 is of KIT-ML, all others not")
+        raise ValueError(f"{given.data}: has the layout {layout}; Table A3 needs KIT-ML, the others HumanML3D")
     settings = load_paper_file("experiments", "acmdm")["settings"]["paper"] | ({"repeats": repeats} if repeats else {})
     if about["kind"] == "control":
         settings["repeats"] = 1  # as released

@@ -167,7 +167,7 @@ def _read(folder: Path, name: str, manifest: dict) -> bytes:
     """Return a file of an artefact; ValueError unless it is the one that was written."""
     path = folder / name
     if not path.is_file():
-        raise ValueError(f"{path}: no such file, but {MANIFEST} speaks of it; restore a whole copy")
+        raise ValueError(f"{path}: is missing, although {MANIFEST} lists this file; restore a whole copy")
     content = path.read_bytes()
     if hashlib.sha256(content).hexdigest() != manifest["files"][name]["sha256"]:
         raise ValueError(f"{path}: content does not match its checksum; restore a whole copy")

@@ -379,7 +379,7 @@ def _num_finished(out: Path, settings: dict, overwrite: bool) -> int:
     """Return how far this very crowd has come; ValueError for anything else."""
     if not (out / _SETTINGS).exists():
         if out.is_file() or any(out.glob("[!.]*")):
-            raise ValueError(f"{out}: holds something else; a crowd needs a folder of its own")
+            raise ValueError(f"{out}: holds other files; choose an empty folder for a crowd")
         return 0
     there = _read_settings(out)  # also before overwriting: what is not ours stays
     if overwrite:
@@ -417,4 +417,4 @@ def _open_rows(folder: Path, settings: dict, mode: str = "r") -> np.memmap:
         return rows
     # What numpy and Python's own tokenizer raise over damaged bytes is no closed list.
     except Exception as error:
-        raise ValueError(f"{path}: is not a whole array ({error}); the crowd has to be made anew") from error
+        raise ValueError(f"{path}: is not a whole array ({error}); generate the crowd again") from error

@@ -23,7 +23,7 @@ def held(lock, made):
     try:
         return lock(made)
     except ValueError as error:
-        log.info("feet         slide as they come: %s", error)
+        log.info("feet         not held: %s", error)
         return made
 
 

@@ -319,7 +319,7 @@ def export_onnx(
     """
     folder = Path(folder)
     if trained.config is None:
-        raise ValueError(f"{trained.name} is an autoencoder alone: export a model that denoises")
+        raise ValueError(f"{trained.name} is only an autoencoder: export a model that denoises")
     if not overwrite and (folder / PROGRAM).exists():
         raise ValueError(f"{folder / PROGRAM}: exists already; pass --overwrite or another --out")
     card, network = model_card(trained, num_steps), network_with(trained.config, trained.params)

@@ -222,7 +222,7 @@ def _as_scene(given) -> Scene:
     whole = getattr(given, "characters", None)
     whole = whole if isinstance(whole, (list, tuple)) else [whole]
     if not whole or not all(isinstance(one, (Character, Motion)) for one in whole):
-        raise ValueError(f"a scene of the player is {given!r:.60}; give a Motion, a Character or a Scene with some")
+        raise ValueError(f"cannot show {given!r:.60}; give a Motion, a Character or a Scene that has characters")
     whole = [Character(one) if isinstance(one, Motion) else one for one in whole]
     return Scene(whole, given.title, given.note, given.boundaries)
 

@@ -54,7 +54,7 @@ def steer_page(
     """
     check_known(runtime, RUNTIMES, "runtime")
     if trained.diffusion.sampler != "ddim":
-        raise ValueError(f"{trained.name} is sampled by {trained.diffusion.sampler!r}, the page walks by 'ddim' alone")
+        raise ValueError(f"{trained.name} is sampled by {trained.diffusion.sampler!r}, the page supports only 'ddim'")
     card = model_card(trained, num_steps)
     if missing := [style for style in trained.styles if style not in trained.start_poses]:
         raise ValueError(f"{trained.name} stores no starting pose for {missing[0]!r}, from which the page could start")
@@ -134,7 +134,7 @@ def package_file(package: str, path: str) -> bytes:
     try:
         archive = pooch.retrieve(url, f"sha512:{pinned['sha512']}", fname=name, path=folder)
     except (OSError, ValueError) as error:
-        raise ValueError(f"{url}: not fetched ({error}); put that file at {folder / name} yourself") from None
+        raise ValueError(f"{url}: download failed ({error}); save this file as {folder / name} yourself") from None
     with tarfile.open(archive) as files:
         return files.extractfile(f"package/{path}").read()
 

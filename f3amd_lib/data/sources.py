@@ -267,7 +267,7 @@ class _File(NamedTuple):
         try:
             return self.reader()
         except Exception as error:  # whatever a damaged member of a zip, or a file that went away, raises
-            raise ValueError(f"{self.label}: damaged, nothing of it is used ({error}); fetch it again") from error
+            raise ValueError(f"{self.label}: damaged and not used ({error}); fetch the file again") from error
 
     def size_and_crc(self) -> tuple[int, int]:
         """Return size and CRC-32: from a zip's directory, or by reading a plain file."""
@@ -318,7 +318,7 @@ def _find_files(name: str, path) -> tuple[Path, dict[str, _File]]:
     if not place.exists():
         raise ValueError(f"{place}: there is no such file or folder; check the path")
     if place.is_file() and place.suffix.lower() in _READ:
-        raise ValueError(f"{place}: is a single file; name the folder that it lies in")
+        raise ValueError(f"{place}: is a single file; give its folder")
     if place.is_dir() and name != "folder":
         zips = [item for item in sorted(place.glob("[!.]*.[zZ][iI][pP]")) if name in item.name.lower()]
         if len(zips) > 1:
@@ -338,7 +338,7 @@ def _download(name: str) -> str:
     published, folder = _SETS[name], pooch.os_cache("f3amd")
     if "url" not in published:
         how = f"name its folder or zip by --source (path=...), or set {DATA_DIR_VARIABLE}"
-        raise ValueError(f"data set {name!r} is downloaded from nowhere: {how}")
+        raise ValueError(f"data set {name!r} has no download: {how}")
     pooch.get_logger().setLevel("WARNING")
     url, digest, file = published["url"], published.get("hash"), published["file"]
     try:
@@ -390,7 +390,7 @@ def _read_take(file: _File, expected: tuple[int, int], sha256_prefix="", cut=Non
     data, label = file.read(), file.label
     sound = (len(data), zlib.crc32(data)) == expected
     if not (sound and hashlib.sha256(data).hexdigest().startswith(sha256_prefix)):
-        raise ValueError(f"{label}: is not the file that it should be, nothing of it is used; fetch it again")
+        raise ValueError(f"{label}: is not the expected file and was not used; fetch the file again")
     motion = parse_bvh(data, label)
     if cut is None:
         return motion
@@ -531,7 +531,7 @@ def _read_table(place: Path, files: Mapping[str, _File], table: str, columns: li
     try:
         return label, pd.read_csv(content, usecols=columns, dtype=str, encoding="utf-8-sig", skip_blank_lines=False)
     except ValueError as error:
-        raise ValueError(f"{label}: is not the table that it should be ({error}); fetch it again") from error
+        raise ValueError(f"{label}: is not the expected table ({error}); fetch the file again") from error
 
 
 def _read_frame_cuts(place: Path, files: Mapping[str, _File]) -> dict[tuple[str, str], tuple[int, int]]:

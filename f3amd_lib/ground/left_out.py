@@ -27,7 +27,7 @@ def leave_out(
     named = "; ".join(f"{record}: {reason}" for record, reason in every[:3]) + ("; ..." if len(every) > 3 else "")
     if len(broken) > MOST_BROKEN * num_records:
         what = f"{len(broken)} of {num_records} records are broken, more than {MOST_BROKEN:.0%}"
-        raise ValueError(f"{where}: {what}; mend them or take them out: {named}")
+        raise ValueError(f"{where}: {what}; fix or remove them: {named}")
     if every:
         of_parts = f", and {len(parts)} parts of others" if parts else ""
         log.warning(

@@ -28,7 +28,7 @@ def read_text(path) -> str:
         content = Path(path).read_bytes()
         text = content.decode("utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
     except OSError as error:
-        raise ValueError(f"{path}: no such file, or not to be read ({error.strerror}); check the path") from error
+        raise ValueError(f"{path}: no such file, or it cannot be read ({error.strerror}); check the path") from error
     except UnicodeDecodeError as error:
         what = f"byte {error.start} is not {error.encoding.upper()}"
         raise ValueError(f"{path}: not a text file ({what}); save it as UTF-8") from error
@@ -64,7 +64,7 @@ def read_text_table(path, *headers: str, others: bool = False) -> list[tuple[str
             rows += [(f"{path}: line {line}:", cells)] if any(cells) else []
             line = reader.line_num + 1
     except csv.Error as error:
-        raise ValueError(f"{path}: line {line}: not a row of a table ({error}); mend the line") from error
+        raise ValueError(f"{path}: line {line}: not a row of a table ({error}); fix the line") from error
     where, names = rows[0] if rows else (f"{path}: line 1:", [])
     names = [name.casefold() for name in names]
     while names[-1:] == [""]:

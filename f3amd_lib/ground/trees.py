@@ -48,7 +48,7 @@ def save_tree(path: Path, tree: Any, metadata: dict) -> None:
         try:
             save_file(arrays, temporary, header)
         except SafetensorError as error:
-            raise OSError(f"{path}: cannot be written ({error}); make room on the disk, then go on") from None
+            raise OSError(f"{path}: cannot be written ({error}); make room on the disk, then try again") from None
 
 
 def _checksum(arrays: dict, description: str) -> str:

@@ -49,7 +49,7 @@ def draw_per_style(clouds: Mapping, count: int, generator: np.random.Generator) 
     """
     for style, cloud in clouds.items():
         if len(cloud) < count:
-            raise ValueError(f"{count} windows of style {style!r} are wanted, of {len(cloud)}")
+            raise ValueError(f"style {style!r} has {len(cloud)} windows, {count} are needed")
     return np.concatenate([cloud[generator.choice(len(cloud), count, replace=False)] for cloud in clouds.values()])
 
 
@@ -206,7 +206,7 @@ def style_accuracy(predicted, asked) -> float:
     """
     predicted, asked = np.asarray(predicted), np.asarray(asked)
     if predicted.shape != asked.shape or not asked.size:
-        raise ValueError(f"{predicted.shape} predicted styles and {asked.shape} asked: give one of each a window")
+        raise ValueError(f"{predicted.shape} predicted styles and {asked.shape} wanted: give one of each a window")
     return float(100.0 * np.mean(predicted == asked))
 
 

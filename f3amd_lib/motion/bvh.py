@@ -194,7 +194,7 @@ def _parse_hierarchy(text: str) -> tuple[list[_Joint], list[tuple[int, list[floa
             first = f"the first is {joints[0].name!r} in line {joints[0].line}"
             raise _Broken(line, f"a second ROOT ({first}); a file holds one character: split it")
         if keyword != "ROOT" and not open_joints:
-            raise _Broken(line, f"{keyword!r} stands outside of the ROOT's braces; {_BRACES}")
+            raise _Broken(line, f"{keyword!r} is outside the ROOT's braces; {_BRACES}")
         if keyword in ("ROOT", "JOINT"):
             name = " ".join(words[0].split())
             if name in taken:
@@ -279,7 +279,7 @@ def _parse_motion(data: bytes, place: int, joints: list[_Joint]) -> tuple[np.nda
     if len(values) == np.prod(shape) and None not in values:
         return np.reshape(np.array(values, np.float64), shape), frame_time
     what = f"Frames: says {count}, but {frame} rows of numbers follow"
-    raise _Broken(*(broken or (line_at(head.start(1)), f"{what}; export the file again or mend the count")))
+    raise _Broken(*(broken or (line_at(head.start(1)), f"{what}; export the file again or correct the count")))
 
 
 def _build_motion(joints, end_sites, values, frame_time, name) -> Motion:

@@ -82,7 +82,7 @@ class Skeleton:
     def role(self, role: str) -> int:
         """Return the joint that plays a role, such as head or left_toe; ValueError if none does."""
         if role not in self.roles:
-            raise ValueError(f"no joint is known as its {role}; call one of them so: {', '.join(self.names)}")
+            raise ValueError(f"no joint has the role {role}; give one of them this name: {', '.join(self.names)}")
         return self.roles[role]
 
     @property
@@ -117,11 +117,11 @@ class Skeleton:
             labels = [played.get(joint, name) for joint, name in enumerate(labels)]
         for name in labels:
             if twin_name(name) not in labels:
-                raise ValueError(f"joint {name!r} has no twin {twin_name(name)!r}: it cannot be mirrored")
+                raise ValueError(f"joint {name!r} has no twin {twin_name(name)!r}: the skeleton cannot be mirrored")
         twins = [labels.index(twin_name(name)) for name in labels]
         for joint, parent in enumerate(self.parents[1:], start=1):
             if self.parents[twins[joint]] != twins[parent]:
-                raise ValueError(f"the twin of joint {self.names[joint]!r} hangs elsewhere: it cannot be mirrored")
+                raise ValueError(f"the twin of joint {self.names[joint]!r} has another parent: no mirroring")
         return tuple(twins)
 
     @functools.cached_property
@@ -219,7 +219,7 @@ class Motion:
     def needed_rotations(self, why: str) -> np.ndarray:
         """Return the rotations; ValueError says `why` they are needed where there are none."""
         if self.rotations is None:
-            raise ValueError(f"motion {self.name!r} has positions alone: {why} needs rotations, so fit some first")
+            raise ValueError(f"motion {self.name!r} has only positions: {why} needs rotations, so fit some first")
         return self.rotations
 
     @property

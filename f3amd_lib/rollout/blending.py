@@ -139,7 +139,7 @@ def blend_rollout(rollout: Rollout, blend_frames: int) -> Rollout:
       ValueError: for a rollout that is blended already, or N out of range.
     """
     if rollout.blend_frames:
-        raise ValueError(f"blended already, over {rollout.blend_frames} frames; blend the one that the network made")
+        raise ValueError(f"already blended over {rollout.blend_frames} frames; blend the rollout that the network made")
     frames = blend_seams(rollout.frames, rollout.window, blend_frames, history=rollout.history)
     if blend_frames == 0:
         return rollout

@@ -324,7 +324,7 @@ def finished_model(prepared: PreparedData, profile: Profile, preset: str, files:
     recipe = profile_recipe(profile, preset)
     if unlike := _unlike(trained, weights_identity(prepared.model_config(preset), recipe, prepared.packed.fingerprint)):
         raise ValueError(
-            f"{files.model}: a model with other {' and '.join(unlike)} lies there; move it away "
+            f"{files.model}: a model with other {' and '.join(unlike)} is already there; move it away "
             "or name another folder (--out)"
         )
     return trained

@@ -50,7 +50,7 @@ def mesh_lists(distances, levels: Sequence[int], around: Sequence[int], down: Se
     """
     distances = np.round(np.asarray(distances, np.float64), 6)
     if distances.shape != (levels[0], levels[0]):
-        raise ValueError(f"a mesh of {levels[0]} vertices is asked for, the body has {len(distances)}")
+        raise ValueError(f"levels begin with {levels[0]} vertices, the body has {len(distances)}")
     np.fill_diagonal(distances, -1.0)  # a vertex is its own nearest, even where another lies on it
     order, reach = [0], distances[0]
     while len(order) < levels[1]:

@@ -64,7 +64,7 @@ def write_humanml3d(folder, data: TextMotions) -> Path:
         raise ValueError(f"{folder}: exists already and is not empty; choose another folder")
     training = set(data.members("train"))
     if len(set(data.names)) != data.num_clips:
-        raise ValueError(f"data set {data.name!r}: two clips are called alike; rename one")
+        raise ValueError(f"data set {data.name!r}: two clips have the same name; rename one")
     with whole_folder(folder) as temporary:
         for part in ("new_joints", "new_joint_vecs", "texts"):
             (temporary / part).mkdir()

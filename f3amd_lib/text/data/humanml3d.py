@@ -210,7 +210,7 @@ def _statistics(folder: Path, joints: int) -> tuple[np.ndarray, np.ndarray] | No
             raise ValueError(f"shapes {mean.shape} and {deviation.shape}, or not finite")
     except Exception as error:  # as above
         what = f"are not mean and deviation of {12 * joints - 1} numbers ({error})"
-        raise ValueError(f"{files[0]} and Std.npy {what}; remove them, and they are reckoned anew") from error
+        raise ValueError(f"{files[0]} and Std.npy {what}; remove them, and they are computed again") from error
     return mean, deviation
 
 
@@ -225,7 +225,7 @@ def _skeleton_of(folder: Path, ids) -> tuple[Skeleton, dict]:
             terms = [described.get(key, "") for key in ("name", "licence", "credit")]
             texts = [*skeleton.names, *terms, *described["pairs"].values()]
             if not 0.0 < described["fps"] <= 1000.0 or not all(isinstance(text, str) for text in texts):
-                raise ValueError("its rate is none, or its names and terms are no text")
+                raise ValueError("its frame rate is not valid, or its names and terms are not text")
         except (LookupError, TypeError, ValueError, AttributeError, RecursionError, OverflowError) as error:
             raise ValueError(f"{own}: is not a skeleton of ours ({error}); write the folder again") from error
         return skeleton, described | {"contact_step": CONTACT_STEP}  # its positions are in metres
@@ -240,4 +240,4 @@ def _skeleton_of(folder: Path, ids) -> tuple[Skeleton, dict]:
             return layout_skeleton(known[joints]), {"name": known[joints], "pairs": {}, **LAYOUTS[known[joints]]}
         reasons.append(f"{name} has {joints} joints")
     what = f"no clip of HumanML3D's 22 joints or KIT-ML's 21 ({reasons[0] if reasons else 'no id is listed'})"
-    raise ValueError(f"{folder}: {what}; a skeleton.json tells others")
+    raise ValueError(f"{folder}: {what}; describe other skeletons in a skeleton.json")

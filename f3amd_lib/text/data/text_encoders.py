@@ -108,7 +108,7 @@ def check_words(caption: str, known: Sequence[str]) -> None:
     if unknown := [word for word in _words(caption) if word not in vocabulary]:
         hint = nearest_hint(unknown[0], vocabulary)
         never = f"the model never saw {', '.join(map(repr, unknown))}{hint}"
-        raise ValueError(f"caption {caption!r}: {never}; --any-words (any_words=True) lets them through")
+        raise ValueError(f"caption {caption!r}: {never}; --any-words (any_words=True) allows them")
 
 
 def words_of(captions: Sequence[str]) -> tuple[str, ...]:

@@ -495,7 +495,7 @@ def judge_motions(
     seen = table.loc[(table["system"] == "real") & (table["metric"] == "R_precision_3"), "value"].item()
     if seen < bar:
         raise ValueError(
-            f"R-precision at 3 of real clips {seen:.2f}, under {bar}: the judge does not see; train it longer"
+            f"R-precision at 3 of real clips {seen:.2f}, under {bar}: this judge is too weak; train it longer"
         )
     for place, what in ((2, "unit"), (3, "better")):
         table.insert(place, what, [getattr(METRICS[name], what) for name in table["metric"]])

@@ -435,7 +435,7 @@ class ControlBranch(Trunk):
     def __init__(self, config: ACMDMConfig, frames_per_state: int, *, rngs: nnx.Rngs):
         super().__init__(config, rngs=rngs)
         if config.conditioning != "adaln" or config.block_frames:
-            raise ValueError("a control branch stands beside a network with conditioning 'adaln' and block_frames 0")
+            raise ValueError("a control branch needs a network with conditioning 'adaln' and block_frames 0")
         self.frames_per_state, width = frames_per_state, config.latent_width
         self.control_input = nnx.Linear(frames_per_state * config.patch_joints * 3, width, rngs=rngs)
         self.control_norm = root_mean_square_norm(width, rngs)

@@ -101,7 +101,7 @@ def read_control_csv(path, num_frames: int) -> tuple[np.ndarray, np.ndarray]:
         if frame != int(frame) or not 0 <= frame < num_frames:
             raise ValueError(f"{where} frame {frame:g} is not one of the clip's, 0 to {num_frames - 1}; see --seconds")
         if frame in points:
-            raise ValueError(f"{where} frame {frame:g} comes twice; keep one of its points")
+            raise ValueError(f"{where} frame {frame:g} occurs twice; keep one of its points")
         points[int(frame)] = [row[axis] for axis in "xyz"]
     if not points:
         raise ValueError(f"{path}: needs at least one row below its header")

@@ -251,7 +251,7 @@ class TextModel(CaptionedModel):
             rest = dataclasses.replace(about["skeleton"], offsets=np.asarray(tree["rest"]))
             mesh = BodyMesh.of(rest, autoencoder.levels, **autoencoder.neighbours)
             if weights_digest(mesh.lists) != said["neighbours"]:
-                raise ValueError("was trained on a body with other neighbours than this version's; train it anew")
+                raise ValueError("was trained on a body with other neighbours than this version's; train it again")
         codec = MotionCodec(axes, autoencoder, tree.get("autoencoder"), latent, redundancy, mesh)
         starts = {caption: np.asarray(state) for caption, state in tree.get("starts", {}).items()}
         return cls(codec=codec, starts=starts, branch=tree.get("branch"), **about)

@@ -53,7 +53,7 @@ def stage_of(name: str) -> str:
     base, branch = preset_and_branch(name)
     preset = presets.find_preset(base)
     if preset.family not in STAGES:
-        raise ValueError(f"{name} needs no captions: train it by a call of its own")
+        raise ValueError(f"{name} needs no captions: train it in a separate call")
     if branch:
         return "control branch"
     return "student" if preset.network.get("guidance_features") else preset.family
@@ -144,7 +144,7 @@ def train_stage(
     if teacher is not None:
         before = load_text_model(teacher)
         if before.name != earlier:
-            raise ValueError(f"{teacher}: holds {before.name}, and {name} stands on {earlier or 'nothing'}")
+            raise ValueError(f"{teacher}: holds {before.name}, and {name} needs {earlier or 'no earlier model'}")
         if not before.record["identity"]["dataset_fingerprint"].startswith(data.fingerprint):
             raise ValueError(f"{teacher}: was trained on other clips than these; leave --teacher out to train one")
     elif earlier:
