@@ -1,7 +1,7 @@
 """The claims ledger: what a paper says, judged from records: `python -m f3amd_companion.ledger.claims`.
 
 Every claim is an entry of the paper's `claims.toml`: its sentence in our words, its place in the
-paper, what decides it, and the statements it stands for, each with its kind of judgement. A verdict
+paper, what decides it, and its statements, each with its kind of judgement. A verdict
 follows from recorded figures alone, and from none of ours to none of the paper's: models of our own
 (`-plus`, `-steady`, `-raw`, ...) decide nothing. The same statements are judged from the paper's own tables,
 which do not always say what its text says.
@@ -72,12 +72,12 @@ class Statement:
     Attributes:
       says: the sentence, in our words.
       rule: its kind of judgement with its parameters, from evidence to verdict and figure.
-      optional: where it was not measured, nobody misses it.
+      optional: not counted where it was not measured.
       remark: it decides nothing.
       verdict: of `VERDICTS`; "" for a remark, and before it is judged.
       figure: what was found, or why nothing was.
       reasons: why no verdict is drawn from it -> the models of which that is true.
-      sources: tables that it rests on, `evidence.Source`.
+      sources: tables behind it, `evidence.Source`.
       networks: trained ones that it looked up.
       known: how much evidence knows of it: 3 for a verdict, 2 for figures without one, less for a gap (`NotMeasured`).
     """
@@ -118,7 +118,7 @@ class Claim:
       text: what is claimed, in our words.
       where: sections and tables of the paper.
       decided_by: the quantity that decides it.
-      statements: what it stands for, not judged yet.
+      statements: its parts, not judged yet.
       paper_says: the paper's figure, if it names one.
       computed: the library decides it by computing, without records.
     """
@@ -251,7 +251,7 @@ class Judgement:
 
 
 def _seen(statements: Iterable[Statement]) -> tuple[Statement, ...]:
-    """Leave out what was not measured and need not be."""
+    """Leave out optional statements that were not measured."""
     return tuple(s for s in statements if not (s.optional and s.verdict == judging.UNMEASURED))
 
 
@@ -521,7 +521,7 @@ def changed_verdicts(frame: pd.DataFrame, accepted: Mapping[str, Mapping[str, st
 
 
 def write_ledger(path: Path, judgements: Sequence[Judgement], *, accept: bool = False) -> list[str]:
-    """Write the ledger as Markdown, and accept its verdicts if asked to.
+    """Write the ledger as Markdown, and with `accept` its verdicts.
 
     Args:
       path: where to, ending in .md. The accepted verdicts lie beside it as JSON.

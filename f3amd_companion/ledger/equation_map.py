@@ -162,7 +162,7 @@ def _documented(path: Path) -> Iterator[tuple[str, str]]:
 
 @dataclass
 class Section:
-    """What stands under one heading of a notebook.
+    """A section of a notebook.
 
     Attributes:
       heading: its line, without the marks: "2.3 One line, three labels (Eq. 9)".

@@ -5,7 +5,7 @@ or the paper's own tables). What the claim is worth follows from them (`combine`
 decide a statement:
 
 - **A stated figure or range** ("3 to 4 times", `within`). A figure whose whole interval lies inside
-  supports it, one whose whole interval lies outside contradicts it; in between nothing can be told.
+  supports it, one whose whole interval lies outside contradicts it; in between it is open.
   A gain beyond the range is another number than the paper's, and has a verdict of its own.
 - **Better or worse** (`ordered`). The interval of the ratio must leave out 1. Otherwise the two
   cannot be told apart.

@@ -271,7 +271,7 @@ BAR_MODELS = ("F3AMD-FNO-96", "F3AMD-FNO-96-steady")
 
 
 def quality_bars(quality: pd.DataFrame, classifier_accuracy: float) -> pd.DataFrame:
-    """Compare measured motion, one denoising step, with what is asked of it.
+    """Compare measured motion, one denoising step, with our bars.
 
     Args:
       quality: from `protocol.summarise`, with real motion and the bad generators.

@@ -64,7 +64,7 @@ def _figures(motion: Motion, path: RootPath, window: int, floor: float) -> dict[
 
 
 def diverged(rollout: Rollout) -> np.ndarray:
-    """Tell which characters of a rollout have left their path for good, or the earth, [B] booleans."""
+    """Tell which characters of a rollout have left their path for good, or the ground, [B] booleans."""
     wanted = np.stack([path.position for path in rollout.paths])
     away = np.linalg.norm(rollout.frames[..., [0, 2]] - wanted, axis=-1).max(axis=-1)
     height = np.abs(rollout.frames[..., 1] - rollout.history[:, -1:, 1]).max(axis=-1)
@@ -96,7 +96,7 @@ def walk_rows(
 
     Returns:
       Columns grid, update, steps, walks, diverged, metric, unit, value, median: means and medians over the walks that
-      did not diverge. One step is the same under all four, and stands once.
+      did not diverge. One step is the same under all four, and listed once.
     """
     styles = list(packed.styles)
     paths = evaluation_paths(packed, styles, num_frames, seed=seed)

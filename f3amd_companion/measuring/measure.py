@@ -104,7 +104,7 @@ def _record(prepared: PreparedData, profile: Profile, measurement: str, **settin
 def _models(
     prepared: PreparedData, profile: Profile, models: Iterable[str] | None, among: Iterable[str] = ()
 ) -> dict[str, TrainedModel]:
-    """Return the models that were asked for by name, or all (of `among`) that have weights."""
+    """Return the named models, or all (of `among`) that have weights."""
     known = available_models(profile)
     names = models or ([name for name in among if name in known] if among else known)
     return {name: obtain_model(prepared, profile, preset=name)[0] for name in names}
@@ -140,7 +140,7 @@ def _measure(
 
 
 def _real_walks(packed: PackedMotion, profile: Profile, styles: list[str]) -> list[tuple[str, Motion]]:
-    """Return (style, motion) of the real clips that stand beside rollouts."""
+    """Return (style, motion) of the real clips to compare with rollouts."""
     clips = reference_clips(packed, styles, window=profile.window)
     return [(packed.styles[packed.clip_style[clip]], packed.motion(clip)) for clip in clips]
 
@@ -300,7 +300,7 @@ def measure_trained(prepared: PreparedData, profile: Profile, models: Iterable[s
 
 
 def measure_sensitivity(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
-    """Ask the metrics themselves (see `measuring.sensitivity`), some minutes in all.
+    """Test the metrics themselves (see `measuring.sensitivity`), some minutes in all.
 
     Whether FID and EMD order graded corruptions, and how many windows they need before they settle.
 
@@ -349,7 +349,7 @@ def measure_foot_spectrum(prepared: PreparedData, profile: Profile, models: Iter
 
 
 def measure_noise_use(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
-    """Ask trained models whether they use their noisy input; single windows, seconds a model.
+    """Measure whether trained models use their noisy input; single windows, seconds a model.
 
     Returns:
       The table `records/noise_use.csv`, a row per model and number of steps (see
@@ -438,7 +438,7 @@ def measure_one_step(prepared: PreparedData, profile: Profile, models: Iterable[
 
 
 def measure_round_times(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
-    """Time a window for 32 characters at 8, 4, 2 and 1 steps, by turns: what a student of one step is compared by.
+    """Time a window for 32 characters at 8, 4, 2 and 1 steps, alternately, to compare students of one step.
 
     A student is as large as its teacher and takes its teacher's time at one step.
 

@@ -267,7 +267,7 @@ def mesh_rows(bench: Bench, trained: TextModel, row: Mapping, about: Mapping, fi
 
 
 def asked_frames(generator: np.random.Generator, lengths, how_many) -> np.ndarray:
-    """Return which frames of each motion are asked for, [N, L]: a number of frames, or a share of them (a float)."""
+    """Return which frames of each motion are controlled, [N, L]: a number of frames, or a share of them (a float)."""
     asked = np.zeros((len(lengths), max(lengths)), bool)
     for row, length in zip(asked, lengths, strict=True):
         count = round(how_many * length) if isinstance(how_many, float) else min(how_many, length)
@@ -703,7 +703,7 @@ def probes_of(real: TextMotions, others: TextMotions, seed: int) -> dict:
 
 
 def measure_judge(data: TextMotions, encoder: TextEncoder, profile: Profile, *, models=None, **leg) -> Path | None:
-    """Ask the judge about real motion and about motion that is wrong on purpose; it is trained if it is not.
+    """Test the judge on real motion and on motion that is wrong on purpose; it is trained if it is not.
 
     Returns:
       The table, `records/text_judge.csv`: system, metric, value, low, high; None where `stop_at` came first.

@@ -1,8 +1,8 @@
 """Speed as records: tidy tables of synthesis and training times, each with its run record.
 
-Synthesis (Tables 1, 4, 7 and the times of Table 11; Figures 3 and 4): what belongs together is timed by turns in one
-process, all models, steps and implementations of one window length and one number of characters, and beside them the
-machine's own matrix product, so that every row can say which share of the machine's arithmetic it used.
+Synthesis (Tables 1, 4, 7 and the times of Table 11; Figures 3 and 4): what belongs together is timed alternately in
+one process, all models, steps and implementations of one window length and one number of characters, and beside them
+the machine's own matrix product, so that every row can say which share of the machine's arithmetic it used.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ class Candidate:
 
     @property
     def group(self) -> tuple[int, int, str]:
-        """What a candidate shares with those that it is timed by turns with."""
+        """What candidates that are timed alternately share."""
         return self.window_frames, self.characters, self.precision
 
 
@@ -120,7 +120,7 @@ def plan(suite: str) -> dict[tuple, list[Candidate]]:
 def time_group(
     candidates: list[Candidate], build_config, *, progress: bool = False, **turns
 ) -> tuple[pd.DataFrame, dict[str, str]]:
-    """Time the candidates of one group by turns, with the matrix products of their frameworks.
+    """Time the candidates of one group alternately, with the matrix products of their frameworks.
 
     Args:
       candidates: of one group.
@@ -233,7 +233,7 @@ def measure_training_time(
     prepared: PreparedData, profile: Profile, *, precision: str = "float32", again: bool = False,
     stop_at: float | None = None,
 ) -> Path | None:  # fmt: skip
-    """Time training steps by turns: the recommended models, the baseline, and two other widths (Table 2).
+    """Time training steps alternately: the recommended models, the baseline, and two other widths (Table 2).
 
     Args:
       prepared: the data; an epoch is once over its training windows.
@@ -311,7 +311,7 @@ PARTS = {
 
 
 def time_breakdown(workload: Workload, **turns) -> pd.DataFrame:
-    """Time a round whole, without each of `PARTS`, and without drawing noise, by turns.
+    """Time a round whole, without each of `PARTS`, and without drawing noise, alternately.
 
     Args:
       workload: a model of Fourier blocks with FiLM, under jit on one device.

@@ -180,7 +180,7 @@ class Crowd:
         return self.settings["styles"][self.style_index[character]]
 
     def target(self, character: int) -> RootPath:
-        """Return the path that a character was asked to follow."""
+        """Return a character's target path."""
         path = np.asarray(self.path[character], np.float64)
         return RootPath(path[:, :2], path[:, 2], self.settings["fps"])
 

@@ -5,7 +5,7 @@
 The paper measures its models this way (section 4.5). The program takes history, path, style and
 noise and returns clean features; weights and noise levels are constants in it, so that compilers
 may fold and repack them. Noise comes from outside: a program then gives the same numbers on every
-device, and has no loop of random bits. What is written here is loaded by `artefact`, which needs
+device, and has no loop of random bits. The result is loaded by `artefact`, which needs
 nothing of this library.
 """
 

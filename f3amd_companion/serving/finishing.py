@@ -19,7 +19,7 @@ log = logging.getLogger("f3amd")
 
 
 def held(lock, made):
-    """Return a motion or a rollout with its feet held where they stand, if its legs are hip, knee, ankle and toe."""
+    """Return a motion or a rollout with supporting feet held in place, if its legs are hip, knee, ankle and toe."""
     try:
         return lock(made)
     except ValueError as error:

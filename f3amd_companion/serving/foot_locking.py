@@ -1,4 +1,4 @@
-"""Foot locking, a post-process that one may ask for: feet that carry the body stand still.
+"""Foot locking, an optional post-process: feet that carry the body stay in place.
 
 Ours, and never used where a row of the paper is measured: there, feet slide as the network lets
 them. Here each toe gets a new path p beside its old one o. While its foot carries, p is one point
@@ -84,7 +84,7 @@ def _without_short(mask, seconds: float, fps: float, ends: bool = False) -> np.n
 
 
 def plan_contacts(positions, skeleton: Skeleton, fps: float = 30.0, floor=None) -> np.ndarray:
-    """Tell when each foot should stand, of motion whose feet may slide, sink and float.
+    """Decide when each foot should support, of motion whose feet may slide, sink and float.
 
     A foot stands while its toe is low, slow, or clearly lower and slower than the other one. Low is
     meant over the lowest the toe gets within a second or so; slow, beside how fast the motion's
@@ -287,7 +287,7 @@ def bend_leg(skeleton: Skeleton, chain, leg, turned, usual, line, reach) -> np.n
 
 
 def lock_feet(motion: Motion, floor: float | None = None) -> Motion:
-    """Let feet stand still while they carry, and never under the floor.
+    """Hold feet in place while they carry, and never under the floor.
 
     Args:
       motion: any motion of a skeleton whose legs are hip, knee, ankle, toe.

@@ -11,7 +11,7 @@ once. The walk around it is three lines in any language (DDIM, `diffusion.sample
 condition is encoded anew at every step, 43 tokens through three linear layers. A whole round with the sampler inside
 is what `serving.export` makes, for StableHLO and IREE.
 
-Beside the program lies a card, JSON: shapes, scales of the features, skeleton, styles, noise levels, and how far the
+A card (JSON) describes the program: shapes, scales of the features, skeleton, styles, noise levels, and how far the
 program is from JAX; and, of F3AMD and CAMDM, a worked example in Python and one in C#.
 
 `prediction` is what the network was trained to say: x0, the noise or the velocity. A teacher of MotionPCM has no input

@@ -80,7 +80,7 @@ class Scene:
 
     Attributes:
       characters: a `Character` or a `Motion`, or a list of them.
-      title: stands over the panel.
+      title: above the panel.
       note: a line below the title, such as a measured time.
       boundaries: frames at which a new window begins, such as `range(32, 240, 32)`; ticks on the
         scrubber.
@@ -255,7 +255,7 @@ def describe_for_web(skeleton: Skeleton) -> dict:
 
 
 def _first_azimuth(motion: Motion) -> float:
-    """Where the camera stands at first: 50 degrees to the right of where the first one faces."""
+    """The camera's first position: 50 degrees to the right of where the first one faces."""
     yaw = stick_figures.yaw_of(motion)
     return round((0.0 if yaw is None else float(yaw[0])) - np.deg2rad(50.0), 4)
 

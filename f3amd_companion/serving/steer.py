@@ -1,8 +1,8 @@
 """A page on which one steers a trained model: the network runs in the browser.
 
 `steer_page` makes one HTML file with everything in it: the weights as ONNX, ONNX Runtime for WebAssembly, three.js, and
-our own modules (`serving/web`). All of it is in the page, as `player.whole_page` says, so that it works from a disk and
-asks nothing of anybody.
+our own modules (`serving/web`). All of it is in the page, as `player.whole_page` says, so that it works from a disk,
+without a network.
 
 Runtime and three.js are npm packages of fixed versions, fetched once from the public registry, checked by sha512 and
 kept in the cache; npm itself is not needed.

@@ -1,4 +1,4 @@
-"""Speed tables from records: ours beside the paper's, and what the library asks of itself."""
+"""Speed tables from records: ours beside the paper's, and our own bars."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def _fastest(table: pd.DataFrame, characters: int, model: str, steps: int, imple
 def speed_bars(times: pd.DataFrame, *, suite: str = "main") -> pd.DataFrame:
     """Compare what was measured on a CPU with what the library asks of itself.
 
-    Shares are of the machine's own matrix product, timed by turns with the rounds. Each system has
+    Shares are of the machine's own matrix product, timed alternately with the rounds. Each system has
     its fastest implementation, in float32.
 
     Args:

@@ -1,6 +1,6 @@
-"""Timing by turns: every candidate runs once, then every candidate again.
+"""Timing in alternation: every candidate runs once, then every candidate again.
 
-A machine that others use, or that grows warm, is slower for some seconds. By turns (A B A B) such a
+A machine that others use, or that grows warm, is slower for some seconds. Alternation (A B A B) such a
 spell hits all candidates alike, so that ratios keep their meaning where single times do not.
 """
 
@@ -54,7 +54,7 @@ def take_turns(
     candidates: Mapping[str, Callable[[], object]], *, min_rounds: int = 100, min_seconds: float = 10.0,
     fewest_rounds: int = 5, warmup: int = 3, clock: Callable[[], float] = time.perf_counter, progress: bool = False,
 ) -> dict[str, Timing]:  # fmt: skip
-    """Time functions by turns until each has had enough rounds or seconds.
+    """Time functions alternately until each has had enough rounds or seconds.
 
     Args:
       candidates: name -> function without arguments that comes back when its work is done (JAX

@@ -24,7 +24,7 @@ def default_sampler(objective: str, schedule: NoiseSchedule) -> str:
 
 
 def network_time(schedule: NoiseSchedule, t):
-    """Return what a network is told of schedule time, any shape: t, or of K levels the number, 0 the least noisy."""
+    """Return a network's input for schedule time, any shape: t, or of K levels the number, 0 the least noisy."""
     return t if schedule.levels is None else len(schedule.levels) * (1.0 - t) - 1.0
 
 

@@ -1,4 +1,4 @@
-"""What a network predicts: noise or velocity, told as the clean estimate that samplers ask for; and guidance.
+"""What a network predicts: noise or velocity, turned into the clean estimate that samplers need; and guidance.
 
 Wrappers take callables of (x_noisy, sigma), the variance-exploding state, and return a denoiser. All of them
 describe one and the same walk: with an exact network every kind of prediction gives the same samples.
@@ -20,7 +20,7 @@ def prediction_target(objective: str, x0, noise):
 
 
 def clean_estimate(objective: str, prediction, state, alpha, sigma):
-    """Return the motion that a prediction stands for; the inverse of `prediction_target`.
+    """Return the clean motion of a prediction; the inverse of `prediction_target`.
 
     Args:
       objective: of `OBJECTIVES`.

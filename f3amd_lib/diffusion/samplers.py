@@ -73,7 +73,7 @@ def ddim_step_vp(z, x0_hat, alpha_bar, alpha_bar_next):
 
 
 def ddim_step_literal(x_noisy, x0_hat, sigma, sigma_next):
-    """Take the printed update as it stands: a variance-exploding state in, a preserving one out.
+    """Take the printed update literally: a variance-exploding state in, a preserving one out.
 
     The answer is that of `ddim_step` times 1 / sqrt(1 + sigma_next^2). Whoever hands it to the
     network as the state at `sigma_next` shows it a state that is too small by this factor.
@@ -98,7 +98,7 @@ def ddim_step_literal(x_noisy, x0_hat, sigma, sigma_next):
 def ddpm_posterior(alpha_bar, alpha_bar_next):
     """Return what DDPM's ancestral step draws from: z at `alpha_bar_next`, given z and x0.
 
-    Of the two variances that DDPM allows this is the smaller, which is exact once x0 is known.
+    DDPM allows two variances; this is the smaller, which is exact once x0 is known.
     The root of alpha_bar / alpha_bar_next, the paper's alpha_t, stands in the coefficient on z.
 
     Args:

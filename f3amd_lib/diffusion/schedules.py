@@ -55,13 +55,13 @@ class NoiseSchedule:
         return self.alpha(t) * x0 + self.sigma(t) * noise
 
     def times(self, num_steps: int, spacing: str = "endpoints") -> np.ndarray:
-        """Return the times at which an N-step sampler asks the network.
+        """Return the times at which an N-step sampler evaluates the network.
 
         With fewer steps than levels a schedule of K levels is respaced: the network sees only levels that it
         was trained on. The first is the noisiest, also for N = 1, because a sampler starts from noise alone.
         "leading" is the exception: a respacing rule in use for diffusion models, whose strides count from level
-        0. A single stride then ends where it starts: at the least noisy level, where the network is told
-        that pure noise is almost clean motion.
+        0. A single stride then ends where it starts: at the least noisy level, where the network sees pure
+        noise labelled as almost clean motion.
 
         Args:
           num_steps: network evaluations N; at most K where there are K levels.

@@ -230,7 +230,7 @@ def crowd_figure(crowds: Mapping[str, tuple], frame: int, *, width: float = 12.0
 
     Bodies have the thickness of a person's, far ones come first and paler. Nearer limbs cover those
     behind them by an outline in white, which keeps bodies apart in grey print too. On the ground lies
-    where the lower toe was in the last second and a half: feet that stand leave dots, feet that slide strokes.
+    where the lower toe was in the last second and a half: supporting feet leave dots, sliding feet strokes.
 
     Args:
       crowds: title (further lines stand smaller below it) -> (motions, a colour for each).

@@ -1,7 +1,7 @@
 """Profiles: how much is done. `smoke` in seconds, `laptop` in minutes, `gpu` in hours.
 
-A profile says how much, a data set says on what; every notebook takes both as parameters and asks
-`load_profile` for the numbers. Papermill accepts a misspelt parameter with a mere warning, so that
+A profile says how much, a data set says on what; every notebook takes both as parameters and reads
+the numbers by `load_profile`. Papermill accepts a misspelt parameter with a mere warning, so that
 unknown names and wrong types are refused here.
 """
 

@@ -46,7 +46,7 @@ THROUGH_CLASSIFIER = frozenset(_TABLES["through_classifier"])
 
 
 def run_record(*, profile, dataset, seed: int, **extra) -> dict:
-    """Describe a run: what was asked for, on which data, code and machine.
+    """Describe a run: settings, data, code and machine.
 
     Args:
       profile: a profile's name, or an object with a `name`.
@@ -81,7 +81,7 @@ def run_record(*, profile, dataset, seed: int, **extra) -> dict:
 
 
 def record_hash(record: dict) -> str:
-    """Hash what was asked for, leaving out machine, versions, code state and date.
+    """Hash the settings, leaving out machine, versions, code state and date.
 
     Args:
       record: from `run_record`.
@@ -299,9 +299,9 @@ def whole_table(path) -> tuple[pd.DataFrame, dict] | None:
 
 
 def kept_rows(path, record: dict) -> pd.DataFrame | None:
-    """Return the rows of an earlier run that asked for the same, so that a stopped run goes on.
+    """Return the rows of an earlier run with the same settings, so that a stopped run continues.
 
-    A table that asked for something else is kept under another name, and so is a broken one: a run may
+    A table with other settings is kept under another name, and so is a broken one: a run may
     have been killed between the table and its record.
 
     Args:
@@ -322,7 +322,7 @@ def kept_rows(path, record: dict) -> pd.DataFrame | None:
 
 
 def others_rows(path, record: dict) -> pd.DataFrame | None:
-    """Return the rows that another run left which asked for the same, or None; its table is only read."""
+    """Return the rows of another run with the same settings, or None; its table is only read."""
     try:
         rows, theirs = read_table(path)
     except (ValueError, FileNotFoundError):

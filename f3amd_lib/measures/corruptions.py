@@ -77,7 +77,7 @@ def shuffled_frames(motion: Motion, seed: int = 0, strength: float = 1.0) -> Mot
 
 
 def noisy_motion(motion: Motion, seed: int = 0, strength: float = 1.0) -> Motion:
-    """Add Gaussian noise to every frame by itself: the right motion, trembling.
+    """Add Gaussian noise to every frame by itself: the right motion, shaking.
 
     Args:
       motion: any motion of T frames.

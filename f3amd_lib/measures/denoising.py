@@ -85,7 +85,7 @@ def x0_error_by_sigma(trained: TrainedModel, windows: WindowSet, sigmas, *, seed
 def held_out_error(trained: TrainedModel, windows: WindowSet, *, seed: int = 0) -> float:
     """Return how far joints of the clean estimates lie from held-out ones, cm; it compares where losses do not.
 
-    The mean over CAMDM's eight noise levels; a network that was told levels of its own is asked these.
+    The mean over CAMDM's eight noise levels; a network trained on its own levels is evaluated at those.
     """
     shared = np.minimum(variance_preserving_cosine().levels, trained.diffusion.sigma_max)
     levels = getattr(trained.config, "noise_levels", ()) or shared

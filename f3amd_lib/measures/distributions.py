@@ -168,7 +168,7 @@ def style_coverage(generated_counts, target_counts) -> float:
 
     Args:
       generated_counts: windows that the classifier takes for each style, [S].
-      target_counts: windows that were asked of each style, [S].
+      target_counts: windows wanted of each style, [S].
 
     Returns:
       Percent, 0 to 100.
@@ -187,7 +187,7 @@ def style_coverage(generated_counts, target_counts) -> float:
 
 
 def style_accuracy(predicted, asked) -> float:
-    """Share of windows that the classifier takes for the style that was asked for.
+    """Share of windows that the classifier takes for the wanted style.
 
         100 * mean_i [predicted_i = asked_i].
 

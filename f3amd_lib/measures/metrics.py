@@ -232,7 +232,7 @@ def foot_sliding(positions, toes, floor_shift=None, contact_height: float = CONT
     Returns:
       (value, contact_share), one pair of numbers a character. The share is over toe-frames, in
       [0, 1]. Without any contact the value is 0, as in CAMDM's code: a floating figure slides
-      nowhere, which is why the share stands beside it. NaN where the root stands still.
+      nowhere, so read the share beside it. NaN where the root stands still.
 
     Raises:
       ValueError: for NaN, a wrong shape, toe indices out of range, or fewer than 2 frames.

@@ -133,7 +133,7 @@ class ClassifiedWindows(NamedTuple):
     Attributes:
       features: [N, D].
       predicted: class of each window, [N].
-      style: class that was asked for, [N].
+      style: wanted class, [N].
       source: number of the motion that a window was cut from, [N].
     """
 
@@ -156,7 +156,7 @@ def classify_windows(
     Args:
       classifier: whose features and classes are wanted.
       motions: of the classifier's skeleton.
-      styles: what each was asked to look like.
+      styles: the wanted style of each.
 
     Raises:
       ValueError: if no motion is long enough, or for an unknown style.

@@ -50,7 +50,7 @@ def _speeds(packed: PackedMotion, clip: int) -> np.ndarray:
 def style_pace(packed: PackedMotion, style: str) -> float:
     """Return how fast a style usually moves: median speed of its moving training frames, m/s.
 
-    A path that asks an exhausted walker to run asks for what no data shows.
+    A path should not make an exhausted walker run, which no data shows.
 
     Args:
       packed: the data set.
@@ -83,7 +83,7 @@ def style_floor(packed: PackedMotion, style: str) -> float:
 def sideways_share(path: RootPath) -> float:
     """Return the share of moving frames that go more than 45 degrees off the facing, in [0, 1].
 
-    A path that asks for sideways steps where the data has none asks for what nobody has shown.
+    A path should not need sideways steps where the data has none.
 
     Args:
       path: of a target or, from `path_from_motion`, of a clip.
@@ -121,7 +121,7 @@ def own_path(motion: Motion, frames: int = 41) -> RootPath:
 
 
 def reference_clips(packed: PackedMotion, styles: Sequence[str], *, window: int, split: str = "test") -> list[int]:
-    """List the real clips that stand beside a rollout: held out, same styles, same speeds.
+    """List the real clips to compare with a rollout: held out, same styles, same speeds.
 
     Args:
       packed: the data set.

@@ -62,7 +62,7 @@ def lower_toe_speed(positions, skeleton: Skeleton, fps: float = 30.0) -> np.ndar
 
 
 def slide_speed(positions, skeleton: Skeleton, fps: float = 30.0):
-    """Median speed of the lower toe over the ground, cm/s: 0 for feet that stand."""
+    """Median speed of the lower toe over the ground, cm/s: 0 for supporting feet."""
     return np.median(lower_toe_speed(positions, skeleton, fps), axis=-1)
 
 
@@ -78,7 +78,7 @@ def floor_penetration(positions, skeleton: Skeleton, floor=0.0):
 
 
 def seam_kick(positions, window: int):
-    """Acceleration at the seams over that of all other frames; motion without seams reads 1.
+    """Acceleration at the seams over acceleration elsewhere; motion without seams has 1.
 
     Args:
       positions: [..., T, J, 3], metres; window k starts at frame k * window.

@@ -336,7 +336,7 @@ def write_bvh(path, motion: Motion, *, overwrite: bool = False) -> Path:
 def format_bvh(motion: Motion) -> str:
     """Return a motion as BVH text in centimetres: six channels at the root, R = Rz Rx Ry at every joint.
 
-    Joints are written depth first, as BVH asks; line ends are LF, numbers have six decimals. Read again, joint
+    Joints are written depth first, as BVH requires; line ends are LF, numbers have six decimals. Read again, joint
     positions agree to 1e-6 m.
     """
     rotations, skeleton, depth_first = motion.needed_rotations("a BVH file"), motion.skeleton, []

@@ -209,7 +209,7 @@ def _plan_path(style, seconds: float, rng: np.random.Generator) -> _Path:
 
 
 def _given_path(path: RootPath) -> _Path:
-    """Lay a path that somebody drew on the planning grid; it goes straight on at both ends."""
+    """Resample a given path on the planning grid; it goes straight on at both ends."""
     frames, fps = path.num_frames, path.fps
     time = _planned_times(frames / fps)
     drawn = np.arange(frames) / fps

@@ -11,7 +11,7 @@ from f3amd_lib.ground.arrays import array_module
 
 
 def sinusoids(place, width: int, base: float):
-    """Return sines and cosines of a place by turns, [...] -> [..., width], at rates from 1 down to near 1 / base."""
+    """Return alternating sines and cosines of a place, [...] -> [..., width], at rates from 1 down to near 1 / base."""
     xp = array_module(place)
     rate = xp.exp(-xp.log(base) * xp.arange(0, width, 2) / width)
     angle = xp.asarray(place)[..., None] * rate
@@ -139,7 +139,7 @@ class MultiHeadAttention(nnx.Module):
         self.output = nnx.Linear(width, width, rngs=rngs)
 
     def __call__(self, asking, answering=None, **options):
-        """Let every frame of one sequence ask all frames of another, or of its own.
+        """Let every frame of one sequence attend to all frames of another, or of its own.
 
         Args:
           asking: [B, T, D].
@@ -193,7 +193,7 @@ class TransformerBlock(nnx.Module):
           z: [B, T, D].
           key: random key for dropout, in training; without one nothing is dropped.
           mask: frames that may be seen, [B, T], one at least; all by default.
-          memory: the sequence that a crossing block asks, [B, S, D].
+          memory: the sequence that a crossing block attends to, [B, S, D].
         """
         keys = [None] * 4 if key is None else jax.random.split(key, 4)
         answer = self.attention(z, mask=mask, dropout_rate=self.dropout, dropout_key=keys[0])

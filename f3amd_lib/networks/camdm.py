@@ -35,8 +35,8 @@ class CAMDMConfig(ConditionedConfig):
       feed_forward_factor: hidden width over D; not in the paper, 4 as in CAMDM's code.
       split_path: give displacement and facing of the path a token each, as CAMDM's code does
         (2 + 3T + H tokens); else one token a frame, as F3AMD's section 6 counts (2 + 2T + H).
-      noise_levels: sigma of the diffusion steps 0 .. K - 1, rising; the network is told the step's
-        number. Empty: it is told sigma, as F3AMD is (for training with a continuous schedule).
+      noise_levels: sigma of the diffusion steps 0 .. K - 1, rising; the network's input is the
+        step's number. Empty: it is sigma, as in F3AMD (for training with a continuous schedule).
 
     Raises:
       ValueError: for sizes that are not positive, or heads that do not divide the width.

@@ -99,7 +99,7 @@ class ConditionEncoder(nnx.Module):
 
     History, path and style go through one linear layer each into tokens of one width; noise
     embeddings, broadcast over the window, ask them by cross-attention (one head unless told). The
-    paper does not mention a position code; without one every frame would ask the same question,
+    paper does not mention a position code; without one every frame would have the same query,
     and c would be constant over the window.
 
     Args:
@@ -200,7 +200,7 @@ class AdaLNZero(nnx.Module):
 
 
 class CrossAttention(nnx.Module):
-    """Every frame asks the frames of c; the answer is added, and the output layer of Eq. 7 follows.
+    """Every frame attends to the frames of c; the answer is added, and the output layer of Eq. 7 follows.
 
     Questions carry a position code, as those of `ConditionEncoder` do: without one, a frame could
     not prefer its own part of c.

@@ -154,7 +154,7 @@ class LayerKeys:
 
 
 class DenoisingNetwork(nnx.Module):
-    """What samplers, training and rollout ask of any network.
+    """What samplers, training and rollout need of any network.
 
     A subclass has `config`, `encode(condition) -> context` (once a round) and `stages`, a generator
     of (name, value) on the way from the noisy state to x0_hat, which comes last. Condition and

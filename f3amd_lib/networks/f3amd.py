@@ -2,8 +2,8 @@
 
     x_noisy -> encoder -> N x (base block under the condition) -> decoder -> x0_hat
 
-Every row of Tables 8 to 11 is a value of `F3AMDConfig`, and so is every filling where the paper is silent. What the
-paper does not have stands in `networks.variants`, which changes single steps of this network.
+Every row of Tables 8 to 11 is a value of `F3AMDConfig`, and so is every filling where the paper is silent. Our
+additions are in `networks.variants`, which changes single steps of this network.
 """
 
 from __future__ import annotations

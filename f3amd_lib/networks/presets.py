@@ -1,7 +1,7 @@
 """Models by the papers' names: `presets.build("F3AMD-FNO-96", channels=129, ...)`.
 
 A preset is a row of a table in a paper (or one of ours, which says so): a network, the noise it is
-trained with, and what its training does differently. All stand in `papers/*/presets.toml`; another
+trained with, and what its training does differently. All are in `papers/*/presets.toml`; another
 paper brings a file of its own and, where its network is a new one, a line of `[families]` in it.
 """
 

@@ -23,7 +23,7 @@ from f3amd_lib.networks.spectral import cosine_basis
 
 @dataclass(frozen=True, kw_only=True)
 class VariantConfig(F3AMDConfig):
-    """An F3AMD network with options of ours; off unless told.
+    """An F3AMD network with our options; off by default.
 
     Attributes:
       block_residual: add each block's input to its output, which begins at 0 (the paper's Figure 2 has none).

@@ -1,4 +1,4 @@
-"""Blending at window boundaries, a post-process that one may ask for (paper section 6).
+"""Blending at window boundaries, an optional post-process (paper section 6).
 
 The paper leaves its rollouts as they come, and so does every figure of this project unless it says
 "blended": what is seen at a seam is what the network made of it. Products blend. We do it by

@@ -17,11 +17,11 @@ class Rollout:
       skeleton: of the characters.
       frames: world frames, [B, F, C], F frames as in the path; metres and 6D, orthonormal.
       history: the frames before the first window, [B, H, C].
-      paths: what each character was asked to follow.
-      styles: what each character was asked to look like.
+      paths: the target path of each character.
+      styles: the wanted style of each character.
       window: T; window k starts at frame k * T.
       blend_frames: frames after each window boundary that were blended; 0 is as it was made.
-      feet_locked: whether feet were held where they stand (`foot_locking`).
+      feet_locked: whether supporting feet were held (`foot_locking`).
     """
 
     skeleton: Skeleton

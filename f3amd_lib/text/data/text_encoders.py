@@ -98,7 +98,7 @@ def check_words(caption: str, known: Sequence[str]) -> None:
     """Refuse words that a model has never seen in its captions.
 
     Args:
-      caption: what was asked for.
+      caption: to check.
       known: captions that the model was trained with.
 
     Raises:

@@ -1,4 +1,4 @@
-"""The judge of text to motion: a trained evaluator, what it may be asked, and figures with intervals.
+"""The judge of text to motion: a trained evaluator, its measures, and figures with intervals.
 
 The published evaluators know the 22 joints of HumanML3D or KIT-ML's 21 alone, so one of their shape is trained here, on
 the training split. It says what it sees before it judges: R-precision is refused where real held-out motion is not

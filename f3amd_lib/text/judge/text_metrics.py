@@ -142,7 +142,7 @@ def foot_skating_ratio(skeleton: Skeleton, positions, fps: float = 20.0) -> floa
 
 
 def control_errors(positions, wanted, given) -> dict[str, float]:
-    """Compare joints with where they were told to be: of each clip, then the mean over clips (OmniControl's code).
+    """Compare joints with their targets: of each clip, then the mean over clips (OmniControl's code).
 
     Args:
       positions, wanted: [clips, L, J, 3], metres.
