@@ -54,7 +54,7 @@ def retarget(motion: Motion, reference: Motion) -> tuple[Motion, float, np.ndarr
     for whose, roles in ((motion, theirs), (reference, ours)):
         missing = [role for role in NEEDED if role not in roles]
         if missing:
-            what = f"no joint is known as {', '.join(missing)}; it has {', '.join(whose.skeleton.names)}"
+            what = f"no joint has the role {', '.join(missing)}; it has {', '.join(whose.skeleton.names)}"
             raise ValueError(f"motion {whose.name!r}: {what}; --joint-map says which is which")
     wanted = _wanted_points(motion, theirs, skeleton, ours)
     above = np.asarray(reference.needed_rotations("retargeting"), np.float64)[:1]
