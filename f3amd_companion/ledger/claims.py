@@ -394,7 +394,8 @@ def _short(statement: Statement | None) -> str:
     """Return what was found of a statement, behind its mark; metrics that miss and models stay in `statement_table`."""
     if statement is None or statement.verdict == judging.UNMEASURED:
         return ""
-    return f"{_MARKS[statement.verdict]} {re.sub('; not: [^;]*| over [0-9]+ models [(].*?[)]', '', statement.figure)}"
+    figure = re.sub(r"; not: [^;]*| over \d+ models \(.*?\)| in the range", "", statement.figure)
+    return f"{_MARKS[statement.verdict]} {figure}"
 
 
 def _side(verdict: str, statements: Sequence[Statement], where: str = "") -> str:
