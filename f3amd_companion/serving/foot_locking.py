@@ -123,13 +123,10 @@ def plan_contacts(positions, skeleton: Skeleton, fps: float = 30.0, floor=None) 
     other = unrest[:, ::-1]
     sure = (unrest < 0.8) | ((unrest < 0.6 * other) & (above < 0.06))
     likely = (unrest < 1.5) | ((unrest < 0.8 * other) & (above < 0.08))
-    from scipy.signal import find_peaks, peak_widths  # here: half a second that few callers need
-
     for foot in range(2):
         smooth = ndimage.uniform_filter1d(height[:, foot], frames(0.1), mode="nearest")
-        peaks = find_peaks(smooth, prominence=STEP_PROMINENCE)[0]
-        for start, stop in zip(*peak_widths(smooth, peaks, rel_height=0.5)[2:], strict=True):
-            likely[int(np.ceil(start)) : int(stop) + 1, foot] = False
+        for start, stop in _steps(smooth):
+            likely[start:stop, foot] = False
         contact = contacts[:, foot]
         for start, stop in _runs(likely[:, foot]):
             if not sure[start:stop, foot].any():
@@ -140,6 +137,19 @@ def plan_contacts(positions, skeleton: Skeleton, fps: float = 30.0, floor=None) 
                 contact[start + alike[0] : start + alike[-1] + 1] = True
         contacts[:, foot] = _without_short(~_without_short(~contact, _GAP, fps, ends=True), _SHORTEST, fps)
     return contacts
+
+
+def _steps(height):
+    """Yield the upper half, [start, stop), of each peak of a height [T] that stands out by `STEP_PROMINENCE`."""
+    for peak in 1 + np.flatnonzero((height[1:-1] > height[:-2]) & (height[1:-1] >= height[2:])):
+        higher = np.flatnonzero(height > height[peak])  # it stands out over the deeper valley before a higher one
+        k = np.searchsorted(higher, peak)
+        start, stop = higher[k - 1] + 1 if k else 0, higher[k] if k < len(higher) else len(height)
+        depth = height[peak] - max(height[start : peak + 1].min(), height[peak:stop].min())
+        if depth >= STEP_PROMINENCE:
+            low = np.flatnonzero(height < height[peak] - 0.5 * depth)
+            k = np.searchsorted(low, peak)
+            yield low[k - 1] + 1, low[k]
 
 
 # ------------------------------------------------------------------------------ where feet stand

@@ -12,7 +12,6 @@ import struct
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 from scipy.spatial.transform import Rotation
 
 from f3amd_lib.ground.files import named_file, write_whole
@@ -130,6 +129,8 @@ def write_motion_csv(path, motion: Motion, *, overwrite: bool = False) -> Path:
     Raises:
       ValueError: for a file that is there.
     """
+    import pandas as pd  # here: half a second that other formats do not need
+
     frames, joints = motion.positions.shape[:2]
     number = np.repeat(np.arange(frames), joints)
     columns = {"frame": number, "seconds": number / motion.fps, "joint": np.tile(motion.skeleton.names, frames)}

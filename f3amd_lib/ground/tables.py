@@ -13,8 +13,6 @@ import unicodedata
 from collections.abc import Mapping
 from pathlib import Path
 
-import pandas as pd
-
 ARROWS = {"down": " ↓", "up": " ↑"}
 
 
@@ -102,11 +100,11 @@ def fill_tables(page: str, tables: Mapping[str, str], where: str) -> str:
     return page
 
 
-def markdown_table(frame: pd.DataFrame, *, digits: int = 3) -> str:
+def markdown_table(frame, *, digits: int = 3) -> str:
     """Render a DataFrame as a GitHub Markdown table.
 
     Args:
-      frame: any table; the index is left out. Text is kept as it is, so printed numbers keep
+      frame: any DataFrame; the index is left out. Text is kept as it is, so printed numbers keep
         their trailing zeros.
       digits: decimals of floats; larger figures get fewer, so that four digits are shown.
 
@@ -116,6 +114,8 @@ def markdown_table(frame: pd.DataFrame, *, digits: int = 3) -> str:
     Raises:
       ValueError: for a table without columns.
     """
+    import pandas as pd  # here: half a second that reading texts does not need
+
     if len(frame.columns) == 0:
         raise ValueError("a table needs at least one column")
     columns = []
@@ -129,7 +129,7 @@ def markdown_table(frame: pd.DataFrame, *, digits: int = 3) -> str:
     return "".join(f"| {' | '.join(line)} |\n" for line in zip(*columns, strict=True))
 
 
-def compact_table(frame: pd.DataFrame) -> str:
+def compact_table(frame) -> str:
     """Render a table as `markdown_table` does, without columns of blanks, so that a changed cell is a changed line."""
     return re.sub(r" {2,}", " ", re.sub(r"-{4,}", "---", markdown_table(frame)))
 

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
-import pandas as pd
 from flax import nnx
 
 from f3amd_lib.diffusion.flow import default_sampler
@@ -231,7 +230,7 @@ def count_model_flops(config: CheckedConfig) -> tuple[int, int]:
     return count_flops(encode, state, condition), count_flops(denoise, state, x_noisy, sigma, context)
 
 
-def table(paper: str = "f3amd", **settings) -> pd.DataFrame:
+def table(paper: str = "f3amd", **settings):
     """List a paper's denoisers, with a row for every window length that the paper trains them with.
 
     Args:
@@ -245,6 +244,8 @@ def table(paper: str = "f3amd", **settings) -> pd.DataFrame:
     Raises:
       ValueError: for an unknown paper, a setting of no family, or one that is needed and missing.
     """
+    import pandas as pd  # here: half a second that no network needs
+
     known = {name for family in FAMILIES for name in find_family(family)[0].from_data}
     for name in settings:
         check_known(name, known, "setting of the data")
