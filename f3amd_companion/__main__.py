@@ -11,6 +11,9 @@ import logging
 import os
 import re
 import shlex
+import shutil
+import signal
+import subprocess
 import sys
 import textwrap
 import time
@@ -19,13 +22,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
+from f3amd_companion import terminal
+
+if __name__ == "__main__" or Path(sys.argv[0]).stem == "f3amd":
+    terminal.leave_at_once("f3amd: stopped by Ctrl-C")  # while the following is loaded; `main` knows better
+
 import tyro
 from etils import epy
 from tyro.conf import Positional, UseAppendAction
 
-from f3amd_companion import terminal
 from f3amd_lib import __version__
-from f3amd_lib.ground.files import locked, write_whole
+from f3amd_lib.ground.files import check_own_folder, locked, write_whole
 from f3amd_lib.ground.names import check_known, checked_seed, checked_value
 from f3amd_lib.ground.profiles import find_model, load_profile, results_dir, runs_dir
 
@@ -278,6 +285,7 @@ def dataset(
       out: folder to write to; must be empty or new.
     """
     terminal.check_there(captions, source)
+    check_own_folder(out)
     terminal.check_writable(out)
     opened = sources.open_dataset(data, path=source, **people.asked())
     written = captioned_folder.captioned_motions(opened, captioned_folder.read_caption_table(captions), fps=fps)
@@ -397,7 +405,8 @@ def rollout(
       seconds: length of a named path; a CSV has its own.
       speed: of a named path, m/s; a CSV has its own.
       raw: as the network made it: seams are not blended (over 4 frames), supporting feet not held.
-      format: of the motion: bvh, glb (glTF with a body), csv or gif (its first 12 s); several with commas between.
+      format: of the motion: bvh, glb (glTF with a body), csv or gif (its first 12 s; with ffmpeg also as MP4); several
+        with commas between.
       start: a BVH file to continue: its last frames are the history; another humanoid is retargeted.
       out: folder to write to.
     """
@@ -421,7 +430,9 @@ def rollout(
 
 def _targets(folder: Path, name: str, format: str, overwrite: bool) -> list[Path]:
     """Return the files that `_write_shown` writes; ValueError where one is there already and may not be replaced."""
-    targets = [folder / f"{name}{ending}" for ending in (".png", ".html", *_motion_formats(format, "gif"))]
+    endings = [".png", ".html", *_motion_formats(format, "gif")]
+    endings += [".mp4"] if ".gif" in endings and shutil.which("ffmpeg") else []
+    targets = [folder / f"{name}{ending}" for ending in endings]
     terminal.check_free(targets, overwrite)
     return targets
 
@@ -437,6 +448,10 @@ def _write_shown(targets, scene, trained) -> None:
         if path.suffix == ".gif":
             how = {"every": max(1, round(motion.fps / 10)), "max_seconds": 12.0}
             pictures.write_gif(path, motion, target_paths=character.path, titles=[scene.title], **how)
+        elif path.suffix == ".mp4":
+            look = ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p"]
+            how = ["ffmpeg", "-loglevel", "error", "-y", "-i", path.with_suffix(".gif"), *look, path]
+            subprocess.run(how, check=True)
         else:
             motion_files.write_motion(path, motion, credit=credit, overwrite=True)
     _say_written(*targets)
@@ -467,7 +482,8 @@ def text(
       joint: the controlled joint: pelvis, left_foot, right_foot, head, left_wrist or right_wrist.
       any_words: allow words that are in no training caption.
       text_weights: folder of CLIP or Sentence-T5, for a model that was trained with one of them.
-      format: of the motion: bvh, glb (glTF with a body), csv or gif (its first 12 s); several with commas between.
+      format: of the motion: bvh, glb (glTF with a body), csv or gif (its first 12 s; with ffmpeg also as MP4); several
+        with commas between.
       overwrite: replace existing files.
       out: folder to write to.
     """
@@ -534,6 +550,7 @@ def crowd(
     formats, motions = _motion_formats(format) if format else [], out.with_name(f"{out.name}_motions")
     num_frames = _num_frames(seconds)
     terminal.check_free([*drawn, *([motions] if formats else [])], model.overwrite)
+    check_own_folder(out, "crowd.json")
     terminal.check_writable(out)
     named = [model.style(one) for one in style] or None
     log.info("animating    %d characters, %.1f seconds each", characters, num_frames / 30)
@@ -920,7 +937,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     terminal.show_plainly("--quiet" in given)
     name = words[0] if words else ""
     stopped = f"f3amd {name}: stopped by Ctrl-C" + "; the same command goes on from what is written" * (name in RESUMED)
-    if argv is None and name not in ("sweep", "figures", "course"):  # these have processes to end in Python
+    if argv is None and name in ("sweep", "figures", "course"):  # these have processes to end in Python
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    elif argv is None:
         terminal.leave_on_ctrl_c(stopped, at_once=name not in RESUMED)
     try:
         if name and not name.startswith("-"):

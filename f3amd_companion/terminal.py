@@ -84,13 +84,17 @@ def leave(says: str) -> None:
     os._exit(130)
 
 
+def leave_at_once(says: str) -> None:
+    """End on Ctrl-C without a KeyboardInterrupt, which can be a crash while libraries are loaded."""
+    signal.signal(signal.SIGINT, lambda *_: leave(says))
+
+
 def leave_on_ctrl_c(says: str, at_once: bool) -> None:
     """Exit within a second of Ctrl-C, also while compiled code runs and Python sees no signal.
 
     At once where nothing needs cleaning up: a KeyboardInterrupt while libraries are loaded can crash.
     """
-    if at_once:
-        signal.signal(signal.SIGINT, lambda *_: leave(says))
+    leave_at_once(says) if at_once else signal.signal(signal.SIGINT, signal.default_int_handler)
     reading, writing = os.pipe()
     os.set_blocking(writing, False)
     signal.set_wakeup_fd(writing)

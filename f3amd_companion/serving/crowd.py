@@ -33,7 +33,7 @@ from tqdm import tqdm
 
 from f3amd_companion.serving.crowd_planning import FPS, MIN_DISTANCE, keep_apart
 from f3amd_lib.data.features import motion_from_frames, split_frames
-from f3amd_lib.ground.files import locked, write_whole
+from f3amd_lib.ground.files import check_own_folder, locked, write_whole
 from f3amd_lib.ground.names import checked_seed
 from f3amd_lib.ground.trees import errors_name, weights_digest
 from f3amd_lib.motion.root_paths import NAMES, RootPath, named_path
@@ -378,8 +378,7 @@ def _write_settings(folder: Path, settings: dict, finished: int) -> None:
 def _num_finished(out: Path, settings: dict, overwrite: bool) -> int:
     """Return how far this very crowd has come; ValueError for anything else."""
     if not (out / _SETTINGS).exists():
-        if out.is_file() or any(out.glob("[!.]*")):
-            raise ValueError(f"{out}: holds other files; choose an empty folder for a crowd")
+        check_own_folder(out)
         return 0
     there = _read_settings(out)  # also before overwriting: what is not ours stays
     if overwrite:
@@ -404,7 +403,8 @@ def _lay_out(out: Path, settings: dict) -> None:
     """
     rows = np.lib.format.open_memmap(out / _ROWS, "w+", _row_type(settings), (settings["num_characters"],))
     with (out / _ROWS).open("r+b") as file:
-        os.posix_fallocate(file.fileno(), 0, rows.offset + rows.nbytes)
+        if hasattr(os, "posix_fallocate"):  # macOS has none
+            os.posix_fallocate(file.fileno(), 0, rows.offset + rows.nbytes)
 
 
 def _open_rows(folder: Path, settings: dict, mode: str = "r") -> np.memmap:
