@@ -13,6 +13,7 @@ const byId = (id) => document.getElementById(id);
 const embedded = window.parent !== window;
 const HOLD = 0.7; // seconds to rest on the last frame before it starts again
 const HEIGHT = 0.88; // metres above the floor that the camera looks at
+const FARTHEST = 42; // metres, from where a person has a twelfth of the height: of a large crowd one sees the middle first
 const FILL = { height: 2.35, width: 1.9 }; // metres around one person
 const CROWD = 12; // more than so many need not be drawn as well
 const LARGEST = 50e6; // bytes of a file that is dropped here
@@ -292,20 +293,20 @@ function smoothRoot(character) {
 
 function boundsOf(panel) {
   const box = [Infinity, -Infinity, Infinity, -Infinity];
-  const stretch = (x, z) => {
+  const places = []; // twice a second
+  const stretch = (x, z, frame) => {
+    if (frame % 15 === 0) places.push([x, z]);
     [box[0], box[1]] = [Math.min(box[0], x), Math.max(box[1], x)];
     [box[2], box[3]] = [Math.min(box[2], z), Math.max(box[3], z)];
   };
   for (const { root, target } of panel.scene.characters) {
-    for (let k = 0; k < root.length; k += 3) stretch(root[k], root[k + 2]);
-    for (let k = 0; target && k < target.length; k += 2) stretch(target[k], target[k + 1]);
+    for (let k = 0; k < root.length; k += 3) stretch(root[k], root[k + 2], k / 3);
+    for (let k = 0; target && k < target.length; k += 2) stretch(target[k], target[k + 1], k / 2);
   }
   panel.middle = new Vector3((box[0] + box[1]) / 2, HEIGHT, (box[2] + box[3]) / 2);
   panel.reach = Math.hypot(box[1] - box[0], box[3] - box[2]) / 2;
-  panel.corners = [];
-  for (const x of [box[0] - 0.4, box[1] + 0.4]) {
-    for (const z of [box[2] - 0.4, box[3] + 0.4]) panel.corners.push(new Vector3(x, 0, z), new Vector3(x, 1.8, z));
-  }
+  panel.corners = places.flatMap(([x, z]) =>
+    [-0.4, 0.4].flatMap((side) => [0, 1.8].map((y) => new Vector3(x + side, y, z + side))));
 }
 
 // From where one person fills the smallest panel.
@@ -328,9 +329,7 @@ function fitDistance() {
   const { around, elevation, zoom } = view();
   base = near();
   if (!following) {
-    for (const panel of panels) {
-      for (let tries = 0; tries < 120 && !allSeen(panel, base); tries += 1) base *= 1.05;
-    }
+    for (const panel of panels) while (base < FARTHEST && !allSeen(panel, base)) base *= 1.05;
   }
   for (const panel of panels) {
     const reach = following ? 4 : panel.reach + 2;
@@ -892,7 +891,7 @@ function listen() {
 // ---------------------------------------------------------------- start
 
 export async function start() {
-  document.documentElement.classList.toggle("embedded", embedded);
+  document.documentElement.classList.toggle("bare", location.search === "?bare"); // no buttons but play and time
   unpack(await inflate(data.tracks));
   delete data.tracks;
   try {
