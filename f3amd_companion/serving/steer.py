@@ -20,8 +20,8 @@ import pooch
 
 from f3amd_companion.serving.foot_locking import leg_chains
 from f3amd_companion.serving.onnx_export import denoiser_program, model_card
-from f3amd_companion.serving.player import POLICY, read_web, whole_page
-from f3amd_lib.drawing.stick_figures import LIMB_COLORS, TARGET_COLOR, bones_of, head_and_parent
+from f3amd_companion.serving.player import POLICY, describe_for_web, read_web, whole_page
+from f3amd_lib.drawing.stick_figures import LIMB_COLORS, TARGET_COLOR, bones_of
 from f3amd_lib.ground.files import named_file, read_toml, write_whole
 from f3amd_lib.ground.names import check_known
 from f3amd_lib.rollout.start_poses import pose_speed
@@ -36,7 +36,7 @@ _MARKS = {"past": "#b5651d", "taken": "#1b7f4d", "dropped": "#4f7fbf", "target":
 
 def steer_page(
     trained: TrainedModel, *, num_steps: int = 8, weights: str = "int8", program: bytes | None = None,
-    runtime: str = "wasm",
+    runtime: str = "wasm", home: str = "",
 ) -> str:  # fmt: skip
     """Return a page on which one steers characters of a model, HTML; it needs no other file and no network.
 
@@ -47,6 +47,7 @@ def steer_page(
       program: from `onnx_export.denoiser_program`, for any number of characters, instead of exporting here.
       runtime: "wasm"; or "webgpu", which takes the graphics card where the browser lends it, and WebAssembly where it
         does not. That page is larger.
+      home: address that a link at the top leads back to, such as that of a site.
 
     Raises:
       ImportError, ValueError: as `denoiser_program` and `package_file`; for another sampler, an unknown runtime, or a
@@ -72,7 +73,7 @@ def steer_page(
         | {name: getattr(trained.config, name) for name in ("window", "num_history", "channels")}
         | {"legs": legs, "webgpu": runtime == "webgpu"},
         "bones": bones_of(trained.skeleton),
-        "head": head_and_parent(trained.skeleton),
+        "body": describe_for_web(trained.skeleton),
         "paces": paces,
         "colors": LIMB_COLORS,
         "marks": _MARKS,
@@ -88,6 +89,7 @@ def steer_page(
         "policy": f"{POLICY} 'wasm-unsafe-eval'; worker-src blob:",
         "title": html.escape(f"Steer {trained.name}"),
         "name": html.escape(trained.name),
+        "home": f'<a href="{html.escape(home)}">Back</a>' if home else "",
         "about": html.escape(f"{trained.name}, trained on {card['data']}, a diffusion model of {count:,} weights."),
         "window": trained.config.window,
         "history": trained.config.num_history,
@@ -104,7 +106,7 @@ def steer_page(
     script, wasm = RUNTIMES[runtime]
     files = {"worker": _worker(script).encode(), "wasm": package_file("onnxruntime-web", wasm), "program": program}
     files["poses"] = np.asarray(poses, np.float32).tobytes()
-    return whole_page("steer", texts, data, modules, files)
+    return whole_page("steer", texts, data, modules | {"body": read_web("body.js")}, files)
 
 
 def write_steer(path, trained: TrainedModel, *, overwrite: bool = True, **options) -> Path:

@@ -154,7 +154,7 @@ export function blendSeam(history, window, frames) {
 // -------------------------------------------------------------------------------------------------------------- kinematics
 
 // Joints, then tips, of a frame, and the joints' global rotations. A skeleton has parents, offsets, end_sites [[joint, offset]].
-function pose(skeleton, frame) {
+export function pose(skeleton, frame) {
   const joints = skeleton.parents.length, points = new Float64Array(3 * (joints + skeleton.end_sites.length)), turned = [];
   for (let joint = 0; joint < joints; joint++) {
     const parent = skeleton.parents[joint], own = columns(frame, 3 + 6 * joint);

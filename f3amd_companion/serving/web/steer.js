@@ -1,9 +1,9 @@
 // The page around the worker: what the player wishes, when a new window is asked for, and the picture.
 import * as THREE from "three";
-import { FPS, jointPositions } from "motion";
+import { Bodies } from "body";
+import { FPS, jointPositions, pose } from "motion";
 
 const HOP = 8, BLEND = 4, MOST = 32, RECORDED = 1800;
-const STICK = 0.028, JOINT = 0.034, HEAD = 0.1;
 
 // ------------------------------------------------------------------------------------------------------------- the wishes
 
@@ -98,12 +98,9 @@ class Picture {
       this.scene.add(mesh);
       return mesh;
     };
-    const solid = () => new THREE.MeshLambertMaterial();
     const ghost = (opacity) => new THREE.MeshBasicMaterial({ transparent: true, opacity, depthWrite: false });
-    const cylinder = new THREE.CylinderGeometry(1, 1, 1, 10), ball = new THREE.IcosahedronGeometry(1, 2);
-    const disc = new THREE.CircleGeometry(1, 20).rotateX(-Math.PI / 2), bones = data.bones.length;
-    this.sticks = many(cylinder, solid(), MOST * bones);
-    this.balls = many(ball, solid(), MOST * (bones + 2));
+    const cylinder = new THREE.CylinderGeometry(1, 1, 1, 10), bones = data.bones.length;
+    const disc = new THREE.CircleGeometry(1, 20).rotateX(-Math.PI / 2);
     this.shadows = many(disc, ghost(0.16), MOST);
     this.dots = many(disc, ghost(0.75), MOST * 8);
     this.ghosts = many(cylinder, ghost(0.3), 12 * bones);
@@ -130,9 +127,9 @@ class Picture {
     this.grid = new THREE.Mesh(new THREE.PlaneGeometry(80, 80).rotateX(-Math.PI / 2), new THREE.MeshBasicMaterial({ map }));
     this.scene.add(this.grid);
     const { left, right, middle } = this.data.colors;
-    const seen = { left, right, middle };
-    if (this.dark.matches) Object.assign(seen, { right: "#6fa6e6", middle: "#c9c9c9" });
-    this.colors = Object.fromEntries(Object.entries(seen).map(([side, color]) => [side, new THREE.Color(color)]));
+    this.colors = { left, right, middle, flesh: "#aab3bf" };
+    if (this.dark.matches) Object.assign(this.colors, { right: "#6fa6e6", middle: "#c9c9c9", flesh: "#98a2b0" });
+    this.bodies?.paint(this.colors);
     this.shade = new THREE.Color(this.dark.matches ? 0x000000 : 0x2a2620);
   }
 
@@ -178,7 +175,7 @@ class Picture {
   }
 
   begin() {
-    for (const mesh of [this.sticks, this.balls, this.shadows, this.dots, this.ghosts, this.seams]) mesh.count = 0;
+    for (const mesh of [this.shadows, this.dots, this.ghosts, this.seams]) mesh.count = 0;
   }
 
   place(mesh, position, scale, color, turn) {
@@ -198,18 +195,26 @@ class Picture {
     return new THREE.Vector3(points[3 * k], points[3 * k + 1], points[3 * k + 2]);
   }
 
-  body(points, tint) {
-    const { bones, head } = this.data, size = (r) => new THREE.Vector3(r, r, r);
-    for (const [parent, child, side] of bones) {
-      const color = side === "middle" && tint ? tint : this.colors[side], end = this.point(points, child);
-      this.stick(this.sticks, this.point(points, parent), end, STICK, color);
-      this.place(this.balls, end, size(JOINT), color);
-    }
-    if (head) {
-      const top = this.point(points, head[0]), along = top.clone().sub(this.point(points, head[1])).normalize();
-      this.place(this.balls, top.addScaledVector(along, 0.07), size(HEAD), tint ?? this.colors.middle);
-    }
-    this.place(this.shadows, new THREE.Vector3(points[0], 0.004, points[2]), new THREE.Vector3(0.3, 1, 0.3), this.shade);
+  // Bodies of so many characters, of which body.js needs where the bones are.
+  people(count) {
+    if (this.figures?.length === count) return;
+    if (this.bodies) this.scene.remove(this.bodies.group);
+    this.figures = Array.from({ length: count }, (_, k) => ({
+      skeleton: this.data.body, color: k ? this.data.tints[k] : null,
+      bones: this.data.body.parents.map(() => ({ matrixWorld: new THREE.Matrix4() })),
+    }));
+    this.bodies = new Bodies(this.figures);
+    this.bodies.paint(this.colors);
+    this.scene.add(this.bodies.group);
+  }
+
+  // Character k between two frames.
+  body(k, a, b, share) {
+    const { bones } = this.figures[k];
+    bones.forEach(({ matrixWorld }, joint) =>
+      matrixWorld.fromArray(a.places[joint].map((value, i) => value + share * (b.places[joint][i] - value))));
+    const at = new THREE.Vector3().setFromMatrixPosition(bones[0].matrixWorld).setY(0.004);
+    this.place(this.shadows, at, new THREE.Vector3(0.3, 1, 0.3), this.shade);
   }
 
   ghost(points, color) {
@@ -222,7 +227,8 @@ class Picture {
   }
 
   end() {
-    for (const mesh of [this.sticks, this.balls, this.shadows, this.dots, this.ghosts, this.seams]) {
+    this.bodies.update();
+    for (const mesh of [this.shadows, this.dots, this.ghosts, this.seams]) {
       mesh.instanceMatrix.needsUpdate = true;
       if (mesh.instanceColor) mesh.instanceColor.needsUpdate = true;
     }
@@ -272,6 +278,12 @@ export async function start(files) {
   const options = { steps: document.querySelector("input[name=steps]:checked").value, count: 1, hop: HOP, made: false, locking: $("feet").checked };
   const tapes = []; // per character: its points, frame by frame; all end at the same frame
   let newest = 0, clock = 0, pending = false, last = null, seams = [], times = [], drawn = [], waits = 0, rounds = 0, record = [];
+  // A frame's points, and the place of each joint as three.js writes it.
+  const posed = (frame) => {
+    const { points, turned } = pose(card.skeleton, frame);
+    const places = turned.map((axes, k) => [...axes, points.subarray(3 * k, 3 * k + 3)].flatMap((column, i) => [...column, +(i === 3)]));
+    return Object.assign(points, { places });
+  };
   const frameAt = (tape, frame) => tape[Math.min(Math.max(0, tape.length - 1 - newest + frame), tape.length - 1)];
   const root = () => frameAt(tapes[0], Math.floor(clock));
   const wishes = new Wishes(canvas, {
@@ -317,7 +329,7 @@ export async function start(files) {
     tapes.length = Math.min(tapes.length, options.count);
     if (fresh) tapes.length = 0;
     for (let k = tapes.length; k < options.count; k++)
-      tapes.push(histories[k].map((frame) => jointPositions(card.skeleton, frame)));
+      tapes.push(histories[k].map(posed));
     times = [];
   }
 
@@ -334,7 +346,7 @@ export async function start(files) {
     seams.push({ frame: newest, x: last.made[0].history.at(-1)[0], z: last.made[0].history.at(-1)[2] });
     seams = seams.slice(-20);
     last.made.forEach(({ shown }, k) => {
-      for (const frame of shown) tapes[k].push(jointPositions(card.skeleton, frame));
+      tapes[k].push(...shown.map(posed));
       tapes[k].splice(0, Math.max(0, tapes[k].length - 120));
     });
     newest += options.hop;
@@ -354,10 +366,10 @@ export async function start(files) {
 
   function draw() {
     picture.begin();
+    picture.people(tapes.length);
     const frame = Math.floor(clock), share = clock - frame;
     tapes.forEach((tape, k) => {
-      const [a, b] = [frameAt(tape, frame), frameAt(tape, frame + 1)];
-      picture.body(a.map((value, i) => value + share * (b[i] - value)), k === 0 ? null : data.tints[k]);
+      picture.body(k, frameAt(tape, frame), frameAt(tape, frame + 1), share);
     });
     if (last) {
       last.made.forEach(({ path }, k) => {
@@ -431,6 +443,7 @@ export async function start(files) {
   $("panel").addEventListener("click", (event) => {
     if (event.detail > 0 && !event.target.closest("select, details")) setTimeout(() => canvas.focus());
   });
+  $("settings").open = !matchMedia("(max-width: 600px), (max-height: 480px)").matches;
   for (const select of [$("first"), $("second")]) {
     for (const name of card.styles) select.add(new Option(name.replace(/([a-z])([A-Z])/g, "$1 $2"), name));
     select.addEventListener("change", () => canvas.focus());
