@@ -22,7 +22,7 @@ from f3amd_lib.motion.synthetic import synthesize
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
-WORKFLOW = ROOT / ".github" / "workflows" / "site.yml"
+WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
 
 
 def load(path: Path):
@@ -264,7 +264,7 @@ def test_each_fault_of_a_site_is_found(tmp_path, body, fault):
 
 
 def test_actions_are_pinned_to_commits():
-    lines = re.findall(r"uses: (.+)", WORKFLOW.read_text(encoding="utf-8"))
-    assert len(lines) == 4
+    lines = [line for path in WORKFLOWS for line in re.findall(r"uses: (.+)", path.read_text(encoding="utf-8"))]
+    assert len(lines) == 6
     for line in lines:
         assert re.fullmatch(r"actions/[\w-]+@[0-9a-f]{40} # v\d+(\.\d+)*", line), line
