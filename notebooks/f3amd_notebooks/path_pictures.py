@@ -1,4 +1,4 @@
-"""Pictures of bodies for the notebook beside the paper: single poses, and walkers that move inside the page."""
+"""Pictures that move inside a notebook's page, and single poses of a body."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from IPython.display import HTML
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from PIL import Image
+from PIL import Image, ImageSequence
 
 
 def draw_pose(axis, motion: Motion, frame: int, *, at: float, facing: float, color: str = "", words: str = "") -> None:
@@ -60,6 +60,13 @@ def moving_picture(pictures: Sequence[Image.Image], *, fps: float, alt: str, qua
         f"<img src='data:image/webp;base64,{data}' alt='{html.escape(alt)}' width='{first.width}' "
         "style='max-width:100%;height:auto'>"
     )
+
+
+def inline(file, alt: str, seconds: float = 5.0) -> HTML:
+    """Return the beginning of an animated GIF as such a picture."""
+    with Image.open(file) as gif:
+        fps, pictures = 1000 / gif.info["duration"], [frame.convert("RGB") for frame in ImageSequence.Iterator(gif)]
+    return moving_picture(pictures[: round(fps * seconds)], fps=fps, alt=alt, quality=20)
 
 
 @plot_style()
