@@ -119,7 +119,6 @@ site: site-tools onnx-tools ## Build notebooks, claims, gallery and API as a sit
 	JAX_PLATFORMS=cpu $(PYTHON) -m sphinx -q -j auto -W --keep-going -c docs -d docs/_build/doctrees \
 	  . docs/_build/html
 	JAX_PLATFORMS=cpu $(PYTHON) docs/players.py docs/_build/html
-	JAX_PLATFORMS=cpu $(PYTHON) -m f3amd_companion steer --overwrite --out docs/_build/html/steer.html
 	$(PYTHON) docs/check_links.py docs/_build/html
 
 lint: $(INSTALLED) ## Check .py and .ipynb files with ruff, and that each import is declared
@@ -127,7 +126,7 @@ lint: $(INSTALLED) ## Check .py and .ipynb files with ruff, and that each import
 	@$(PYTHON) -m deptry . 2>/dev/null || $(PYTHON) -m deptry .
 
 lab: $(INSTALLED) ## Open the notebook beside the paper in JupyterLab
-	$(PYTHON) -m jupyterlab --notebook-dir=notebooks --LabApp.default_url=/lab/tree/00_beside_the_paper.ipynb $(LAB_OPTIONS)
+	$(PYTHON) -m jupyterlab --notebook-dir=. --LabApp.default_url=/lab/tree/notebooks/00_beside_the_paper.ipynb $(LAB_OPTIONS)
 
 clean: ## Remove caches and build leftovers; keeps .venv, data/, runs/, paper_figures/
 	rm -rf build dist docs/_build .pytest_cache .ruff_cache .coverage* ./*.egg-info

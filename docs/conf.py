@@ -10,6 +10,7 @@ import importlib.metadata
 import importlib.util
 import os
 import sys
+import tomllib
 from pathlib import Path
 
 DOCS = Path(__file__).resolve().parent
@@ -20,6 +21,8 @@ from pages import launch_options  # noqa: E402 (the line above is what finds it)
 
 project = "F3AMD companion"
 author = copyright = "The F3AMD companion authors"
+metadata = tomllib.loads((DOCS.parent / "pyproject.toml").read_text("utf-8"))["project"]
+urls = {name.casefold(): address for name, address in metadata.get("urls", {}).items()}
 release = version = importlib.metadata.version("f3amd_lib")
 
 extensions = [
@@ -90,6 +93,7 @@ html_static_path = ["_static"]
 html_css_files = ["companion.css"]
 html_js_files = ["companion.js"]
 html_extra_path = ["_extra"]
+html_baseurl = f"{address.rstrip('/')}/" if (address := urls.get("documentation")) else ""
 html_favicon = "_static/favicon.svg"
 html_show_sphinx = True
 html_copy_source = True
@@ -105,7 +109,7 @@ html_theme_options = {
     "use_download_button": True,
     "use_fullscreen_button": False,
     "back_to_top_button": True,
-    **launch_options(os.environ.get("F3AMD_REPOSITORY", "")),
+    **launch_options(os.environ.get("F3AMD_REPOSITORY") or urls.get("repository", "")),
     # The ledger's tables need the width.
     "secondary_sidebar_items": {
         "**": ["page-toc.html"],

@@ -1,8 +1,8 @@
-"""Write the player pages of the site: a walker of each data set's crowd, and a crowd by the weights that ship.
+"""Write the pages of the site that move: the walk of its first page, the steer page, walkers and crowds.
 
     python docs/players.py docs/_build/html
 
-A walker is read from the results (`media/14_walker.bvh`); a crowd is made anew, in about a minute on two cores.
+Walks are read from the results (`media/*.bvh`); a crowd is made anew, in about a minute on two cores.
 Pages that the site links to are those of `pages.PLAYERS`.
 """
 
@@ -19,10 +19,21 @@ sys.path[:0] = [str(DOCS / "_ext"), str(DOCS.parent)]
 import pages  # noqa: E402 (the line above is what finds it)
 
 from f3amd_companion.__main__ import main as command  # noqa: E402
-from f3amd_companion.serving.player import write_player  # noqa: E402
+from f3amd_companion.serving.player import Scene, write_player  # noqa: E402
+from f3amd_companion.serving.steer import write_steer  # noqa: E402
+from f3amd_lib.ground.profiles import find_model  # noqa: E402
 from f3amd_lib.motion.bvh import read_bvh  # noqa: E402
+from f3amd_lib.training.checkpoints import load_model  # noqa: E402
 
 CROWD = ("--characters", "64", "--seconds", "8", "--plan", "--pictures")
+
+
+def write_first(site: Path) -> None:
+    """Write the walk of the first page: a real clip, and what our recipe makes of its first frames and its path."""
+    folder = pages.ROOT / "paper_figures" / "bandai" / "laptop"
+    titles = {"real": "A real clip", "steady": "F3AMD-FNO-96-steady, ours: 8 steps a window"}
+    walks = [Scene(read_bvh(folder / f"media/side_by_side_{name}.bvh"), title=titles[name]) for name in titles]
+    write_player(site / "players" / "first.html", walks, strip=False, credit=pages.credit_line(folder))
 
 
 def write_walker(folder: Path, page: Path) -> None:
@@ -50,4 +61,7 @@ def main(site: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    site = Path(sys.argv[1])
+    write_first(site)
+    write_steer(site / "steer.html", load_model(find_model("synthetic")), home="docs/index.html")
+    main(site)

@@ -1,6 +1,6 @@
-"""Fill README.md and docs/results.md with their numbers, from the records.
+"""Fill README.md, docs/index.md and docs/results.md with their numbers, from the records.
 
-    python scripts/fill_numbers.py          # writes both pages
+    python scripts/fill_numbers.py          # writes the pages
     python scripts/fill_numbers.py --check  # says which would change, and ends with 1
 
 A number has its name behind it, in a comment that no reader sees: `takes 12<!-- one_step_ms --> ms`.
@@ -26,7 +26,7 @@ from f3amd_lib.training.checkpoints import load_model
 from f3amd_lib.training.pipeline import PRETRAINED_DIR
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = (ROOT / "README.md", ROOT / "docs" / "results.md")
+PAGES = (ROOT / "README.md", ROOT / "docs" / "index.md", ROOT / "docs" / "results.md")
 RECORDS = ROOT / "paper_figures" / "bandai" / "laptop" / "records"
 TIMES = ROOT / "paper_figures" / "synthetic" / "laptop" / "records" / "synthesis_time.csv"
 FNO, STEADY = "F3AMD-FNO-96", "F3AMD-FNO-96-steady"

@@ -1,5 +1,7 @@
 """Draw the README's moving picture: a real clip and three generated walks on its path, abreast on one floor.
 
+The first two are written as BVH, too: the site's first page plays them (`docs/players.py`).
+
     python scripts/side_by_side.py      (needs the data set bandai: downloaded, or in F3AMD_DATA_DIR)
 
 Everybody starts from the same frames of a clip that no model has seen. What is generated is shown as the network made
@@ -30,6 +32,7 @@ from f3amd_lib.ground.files import whole_file
 from f3amd_lib.ground.profiles import load_profile, repository_root
 from f3amd_lib.ground.records import run_record
 from f3amd_lib.ground.trees import weights_digest
+from f3amd_lib.motion.bvh import write_bvh
 from f3amd_lib.motion.skeleton import resample
 from f3amd_lib.rollout.rollout import MotionGenerator
 from f3amd_lib.training.checkpoints import load_model
@@ -72,7 +75,7 @@ def draw(walkers: dict, line, credit: str) -> list[Image.Image]:
     # Room around everybody at all times, from the credit below the feet to the label above the head.
     roots = np.concatenate([motion.root_position for motion in moved]) * [1.0, 0.0, 1.0]
     around = np.array([0.75, 0.0, 0.0]) * across[0] + np.array([0.0, 0.0, 0.75]) * across[2]
-    corners = [roots + sign * around + [0.0, height, 0.0] for sign in (-1, 1) for height in (-0.15, 2.15)]
+    corners = [roots + sign * around + [0.0, height, 0.0] for sign in (-1, 1) for height in (-0.15, 2.55)]
     seen = camera.project(np.concatenate(corners))[:, :2]
     (left, low), (right, high) = seen.min(axis=0), seen.max(axis=0)
     metre = WIDTH / (right - left)  # pixels, at the middle of the floor
@@ -88,7 +91,8 @@ def draw(walkers: dict, line, credit: str) -> list[Image.Image]:
             ground = np.stack([line[:, 0], np.zeros(len(line)), line[:, 1]], axis=-1) + place * across
             axis.plot(*camera.project(ground)[:, :2].T, color=TARGET_COLOR, linewidth=0.8, alpha=0.5, zorder=1.5)
             x, y = camera.project(motion.root_position[frame] * [1.0, 0.0, 1.0] + [0.0, 1.8, 0.0])[:2]
-            axis.text(x, y, label, color=color, fontsize=8.5, fontweight="bold", ha="center", va="bottom", zorder=20)
+            name = label.replace("-steady", "\n-steady")  # neighbours are as far apart as this is wide
+            axis.text(x, y, name, color=color, fontsize=8.5, fontweight="bold", ha="center", va="bottom", zorder=20)
         axis.text(0.5, 0.012, credit, transform=axis.transAxes, fontsize=7, color="#555555", ha="center", va="bottom")
         canvas.draw()
         pictures.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"))
@@ -108,6 +112,8 @@ def main() -> None:
         weights_digests={name: weights_digest(model.params) for name, model in models.items()},
     )  # fmt: skip
     path = repository_root() / "paper_figures/bandai/laptop/media/side_by_side.webp"
+    for name, motion in zip(("real", "steady"), walkers.values(), strict=False):
+        write_bvh(path.with_name(f"side_by_side_{name}.bvh"), motion, overwrite=True)
     durations = [1000 // FPS] * (len(pictures) - 1) + [1000]  # a pause before it starts again
     with whole_file(path, overwrite=True) as temporary:
         pictures[0].save(

@@ -2,19 +2,22 @@
 
 Texts that are made while it is built (`pages`), equations without a network (`copy_mathjax`),
 figures that say in words what they show (`describe_figures`) and open in full size
-(`enlarge_figures`), and docstrings that are not meant as reStructuredText (`plain_docstring`).
+(`enlarge_figures`), what others show of a page (`describe_page`), and docstrings that are not meant as
+reStructuredText (`plain_docstring`).
 """
 
 from __future__ import annotations
 
 import hashlib
+import html
 import importlib
 import importlib.metadata
 import shutil
 from pathlib import Path
 
 from docutils import nodes
-from pages import INSERT, ROOT, first_sentence, insert, plain_lines
+from pages import INSERT, ROOT, equations, first_sentence, insert, plain_lines
+from PIL import Image
 from sphinx.errors import ExtensionError
 from sphinx.util.osutil import relative_uri
 
@@ -104,6 +107,31 @@ def enlarge_figures(app, doctree, docname) -> None:
             link += image
 
 
+def describe_page(app, name, template, context, doctree) -> None:
+    """Give a page the sentence and the picture by which search engines and messengers show it."""
+    if doctree is None:
+        return
+    said = [node.astext() for node in doctree.findall(nodes.paragraph)]
+    about = first_sentence(next((text for text in said if text.startswith("Question.")), *said[:1]))
+    base, picture = app.config.html_baseurl, "_static/preview.jpg"
+    told = {
+        "description": about, "og:description": about, "og:type": "article", "og:site_name": app.config.project,
+        "og:title": next((node.astext() for node in doctree.findall(nodes.title)), app.config.project),
+        "og:image": base + picture if base else context["pathto"](picture, resource=True),
+    }  # fmt: skip
+    for key, value in told.items():
+        kind = "property" if ":" in key else "name"
+        context["metatags"] += f'<meta {kind}="{key}" content="{html.escape(value)}" />\n'
+
+
+def draw_preview(app, exception) -> None:
+    """Write that picture: one of the README's moving picture."""
+    if exception is None and app.builder.format == "html":
+        with Image.open(ROOT / "paper_figures/bandai/laptop/media/side_by_side.webp") as moving:
+            moving.seek(moving.n_frames // 2)
+            moving.convert("RGB").save(Path(app.outdir) / "_static" / "preview.jpg", quality=85)
+
+
 def in_output(node) -> bool:
     """Return whether a node is part of what a cell put out."""
     while node is not None:
@@ -117,8 +145,9 @@ def in_output(node) -> bool:
 
 
 def plain_docstring(app, what, name, obj, options, lines) -> None:
-    """Read docstrings as what they are, before napoleon makes lists of their sections."""
-    lines[:] = plain_lines(lines)
+    """Read docstrings as what they are, before napoleon makes lists of their sections; equations stand below."""
+    named = equations("\n".join(lines)) if what in ("function", "class", "method") else []
+    lines[:] = plain_lines(lines) + named
 
 
 def import_library() -> None:
@@ -151,6 +180,8 @@ def setup(app):
     app.connect("autodoc-process-docstring", plain_docstring, priority=100)
     app.connect("doctree-resolved", describe_figures)
     app.connect("doctree-resolved", enlarge_figures)
+    app.connect("html-page-context", describe_page)
+    app.connect("build-finished", draw_preview)
     app.connect("env-updated", forget_sourceless)
     app.connect("build-finished", remove_templates)
     return {"version": "1", "parallel_read_safe": True, "parallel_write_safe": True}

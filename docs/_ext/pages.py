@@ -1,7 +1,7 @@
 """What the pages of the site are made of, apart from Sphinx (see `companion`, which hooks it in).
 
-Pages may hold a line `<!-- insert: NAME ARGUMENT -->`, which the functions of `INSERTS` replace by
-Markdown while the site is built:
+Pages may hold a line `<!-- insert: NAME ARGUMENT -->`, which the functions of `INSERTS` replace by Markdown while the
+site is built, and with it what follows until `<!-- until here -->`: that is for whoever reads the file itself.
 
 - `room f3amd_lib.motion`: the docstrings of all modules of one room of the library;
 - `gallery bandai`: figures, animations and players under `paper_figures/bandai/`;
@@ -25,7 +25,7 @@ from PIL import Image
 
 ROOT = Path(__file__).resolve().parents[2]
 
-INSERT = re.compile(r"^<!-- insert: (\w+) ?([\w.]*) -->$", re.M)
+INSERT = re.compile(r"^<!-- insert: (\w+) ?([\w.]*) -->$(?:\n(?:(?!<!--).)*\n<!-- until here -->$)?", re.M | re.S)
 
 # Licences whose terms a caption must repeat in words.
 TERMS = {"CC BY-NC 4.0": "for non-commercial use", "CC BY 4.0": "with credit", "Apache-2.0": "as the code"}
@@ -276,7 +276,7 @@ def readme_markdown(argument: str = "") -> str:
 
 
 def launch_options(address: str) -> dict:
-    """Return the theme's options for buttons on each notebook that open it on Binder, and on Colab.
+    """Return the theme's options for a link to the repository, and buttons that open a notebook on Binder and Colab.
 
     Args:
       address: where everybody reaches the repository; "" gives no options, and no button. Colab opens notebooks of
@@ -292,7 +292,8 @@ def launch_options(address: str) -> dict:
     buttons = {"binderhub_url": "https://mybinder.org", "notebook_interface": "jupyterlab"}
     if address.startswith("https://github.com/"):
         buttons["colab_url"] = "https://colab.research.google.com"
-    return {"repository_url": address, "repository_branch": "main", "launch_buttons": buttons}
+    shown = {"use_repository_button": True, "launch_buttons": buttons}
+    return {"repository_url": address, "repository_branch": "main", **shown}
 
 
 # Players ------------------------------------------------------------------------------------------
@@ -377,6 +378,21 @@ def plain_lines(lines: list[str]) -> list[str]:
     # The first colon of a sentence does not end the name of a type: put an empty name before it.
     block[0] = f": {block[0]}"
     return lines[: start + 1] + [" " * (indent + 2) + line for line in block] + lines[end:]
+
+
+def equations(docstring: str) -> list[str]:
+    """Return, as reStructuredText, the equations that a docstring names: what each says, and its formula as printed."""
+    from f3amd_companion.ledger.equation_map import mentioned_equations  # here: most pages have none
+    from f3amd_lib.ground.papers import load_paper_file
+
+    lines, mentioned = [], mentioned_equations(docstring)
+    for folder in sorted({paper for paper, _ in mentioned}):
+        paper = load_paper_file("paper", folder)
+        for entry in paper.get("equation", ()):
+            if (folder, entry["label"]) in mentioned:
+                lines += ["", f"*{paper['name']} {entry['label']}*: {entry['what']}", ""]
+                lines += [f".. math:: {entry['formula']}", ""] if "formula" in entry else []
+    return lines
 
 
 # Texts --------------------------------------------------------------------------------------------

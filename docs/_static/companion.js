@@ -49,6 +49,45 @@ addEventListener("DOMContentLoaded", () => {
   counts.after(bar);
 });
 
+// A cell of the results knows its column's name; a column "1 step" stands beside that of its model, "CAMDM, 8 steps".
+addEventListener("DOMContentLoaded", () => {
+  for (const table of document.querySelectorAll("#what-was-measured table")) {
+    const names = [...table.querySelectorAll("thead th")].map((cell) => cell.textContent.trim());
+    names.forEach((name, k) => { if (/^\d+ step/.test(name)) names[k] = `${names[k - 1].split(",")[0]}, ${name}`; });
+    for (const cell of table.querySelectorAll("td")) cell.dataset.label = names[cell.cellIndex];
+  }
+});
+
+// One switch hides the code of notebooks, and stays as it was set.
+addEventListener("DOMContentLoaded", () => {
+  const title = document.querySelector(".bd-article h1");
+  if (!title || !document.querySelector(".bd-article .cell_input")) return;
+  const button = Object.assign(document.createElement("button"), { className: "hide-code", type: "button" });
+  const set = (hidden) => {
+    document.documentElement.toggleAttribute("data-no-code", hidden);
+    button.textContent = hidden ? "Show all code" : "Hide all code";
+    localStorage.setItem("no-code", hidden ? "yes" : "");
+  };
+  set(localStorage.getItem("no-code") === "yes");
+  button.addEventListener("click", () => set(!document.documentElement.hasAttribute("data-no-code")));
+  title.after(button);
+});
+
+// Code is copied by a button.
+addEventListener("DOMContentLoaded", () => {
+  if (!navigator.clipboard) return;
+  for (const block of document.querySelectorAll(".bd-article div.highlight")) {
+    if (block.closest(".cell_output")) continue;
+    const button = Object.assign(document.createElement("button"), { className: "copy", type: "button", textContent: "Copy" });
+    button.addEventListener("click", async () => {
+      await navigator.clipboard.writeText(block.querySelector("pre").textContent);
+      button.textContent = "Copied";
+      setTimeout(() => { button.textContent = "Copy"; }, 2000);
+    });
+    block.append(button);
+  }
+});
+
 // Tables: names may break after an underscore or a slash.
 addEventListener("DOMContentLoaded", () => {
   for (const table of document.querySelectorAll(".bd-article table")) {

@@ -112,7 +112,7 @@ def check_own_folder(folder, mark: str = "") -> None:
     """Raise ValueError if a folder holds something, hidden files apart, unless the file `mark` says that it is ours."""
     folder = Path(folder)
     if not (mark and (folder / mark).is_file()) and (folder.is_file() or any(folder.glob("[!.]*"))):
-        raise ValueError(f"{folder}: holds something else; choose a folder of its own")
+        raise ValueError(f"{folder}: holds other files; choose an empty folder")
 
 
 @contextlib.contextmanager

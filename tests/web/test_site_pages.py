@@ -82,15 +82,20 @@ def test_the_first_screen_says_what_this_is_shows_a_walk_and_leads_on(browser, s
     page.screenshot(screenshots / "site_first_page.png")
     seen = "const box = document.querySelector(arguments[0]).getBoundingClientRect();"
     seen += "return box.top >= 0 && box.bottom <= innerHeight && box.width > 100;"
-    assert page.script(seen, ".bd-article h1")
-    assert page.script(seen, ".hero img.moving")
+    assert page.script(seen, ".bd-article h1") and page.script(seen, ".bd-article iframe.first")
+    assert page.find(".actions a").text == "Read beside the PDF"
     cards = page.script(
-        "return [...document.querySelectorAll('.leads a.sd-stretched-link')].filter("
-        "(a) => a.closest('.sd-card').getBoundingClientRect().bottom <= innerHeight)"
-        ".map((a) => a.getAttribute('href'))"
+        "return [...document.querySelectorAll('.leads a.sd-stretched-link')].map((a) => a.getAttribute('href'))"
     )
-    for goal in ("00_reading_guide", "notebooks.html", "claims", "gallery", "api"):
+    for goal in ("00_reading_guide", "notebooks.html", "claims", "gallery", "api", "results"):
         assert any(goal in card for card in cards), (goal, cards)
+    about = "return document.querySelector(`meta[property='og:${arguments[0]}']`).content"
+    assert "Walking characters" in page.script(about, "description")
+    assert (SITE / "docs" / page.script(about, "image")).is_file()
+    page.driver.switch_to.frame(page.find("iframe.first"))
+    page.wait("return document.documentElement.dataset.ready === 'yes'", 60)
+    assert page.script("return document.querySelectorAll('.panel').length") == 2
+    page.driver.switch_to.default_content()
     page.resize(*PHONE, phone=True)
     page.screenshot(screenshots / "site_first_page_phone.png")
 
@@ -138,20 +143,37 @@ def test_what_equations_are_written_with_is_understood(browser):
     assert page.script(faults, r"\nonsense") > 0 and page.script(faults, r"\frac{1}") > 0
 
 
+WORDS = {
+    "alpha_bar": ("02_sampler_theory", "docs/api/diffusion"),
+    "install": ("docs/start", "docs/commands"),
+    "steer": ("docs/commands", "docs/api/serving"),
+}
+"""What is searched for -> pages that must be found."""
+
+
 def test_a_word_is_found_and_leads_to_its_notebook(browser):
-    page = browser.open(f"{(SITE / 'search.html').as_uri()}?q=alpha_bar")
-    page.wait("return /found \\d+ pages?/.test(document.querySelector('main').textContent)", 60)
-    found = page.script("return [...document.querySelectorAll('#search-results li a')].map((a) => a.pathname)")
-    assert any("02_sampler_theory" in address for address in found)
-    assert any("docs/api/diffusion" in address for address in found)
-    assert page.errors() == [] and page.outside() == []
+    for word, pages in WORDS.items():
+        page = browser.open(f"{(SITE / 'search.html').as_uri()}?q={word}")
+        page.wait("return /found \\d+ pages?/.test(document.querySelector('main').textContent)", 60)
+        found = page.script("return [...document.querySelectorAll('#search-results li a')].map((a) => a.pathname)")
+        assert all(any(name in address for address in found) for name in pages), (word, found)
+        assert page.errors() == [] and page.outside() == []
+
+
+def test_all_code_of_a_notebook_is_hidden_by_one_switch_and_a_cell_is_copied(browser):
+    page = browser.open(SITE / "notebooks/05_rollout.html")
+    shown = "return [...document.querySelectorAll('.cell_input')].filter((e) => e.checkVisibility()).length"
+    assert page.script(shown) > 3 and page.script("return document.querySelectorAll('.cell_input .copy').length") > 3
+    page.find(".hide-code").click()
+    assert page.script(shown) == 0
+    page.find(".hide-code").click()
+    assert page.script(shown) > 3
 
 
 def test_the_walk_stands_still_for_who_asked_for_less_motion(browser):
     browser.reduced_motion()
-    page = browser.open(SITE / "docs/index.html")
-    page.wait("return document.querySelector('.hero canvas.moving')")
-    assert page.script("return document.querySelector('.hero img.moving')") is None
-    assert "walks" in page.find(".hero canvas.moving").get_attribute("aria-label")
-    drawn = "const c = document.querySelector('.hero canvas.moving'); return c.width * c.height"
+    page = browser.open(SITE / "docs/gallery/index.html")
+    page.wait("return document.querySelector('canvas.moving') && !document.querySelector('img.moving')", 60)
+    assert "Animation" in page.find("canvas.moving").get_attribute("aria-label")
+    drawn = "const c = document.querySelector('canvas.moving'); return c.width * c.height"
     assert page.script(drawn) > 10_000
