@@ -449,9 +449,8 @@ def _write_shown(targets, scene, trained) -> None:
             how = {"every": max(1, round(motion.fps / 10)), "max_seconds": 12.0}
             pictures.write_gif(path, motion, target_paths=character.path, titles=[scene.title], **how)
         elif path.suffix == ".mp4":
-            look = ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p"]
-            how = ["ffmpeg", "-loglevel", "error", "-y", "-i", path.with_suffix(".gif"), *look, path]
-            subprocess.run(how, check=True)
+            gif = path.with_suffix(".gif")
+            subprocess.run(["ffmpeg", "-loglevel", "error", "-y", "-i", gif, "-pix_fmt", "yuv420p", path], check=True)
         else:
             motion_files.write_motion(path, motion, credit=credit, overwrite=True)
     _say_written(*targets)

@@ -111,8 +111,8 @@ def describe_page(app, name, template, context, doctree) -> None:
     """Give a page the sentence and the picture by which search engines and messengers show it."""
     if doctree is None:
         return
-    said = [node.astext() for node in doctree.findall(nodes.paragraph)]
-    about = first_sentence(next((text for text in said if text.startswith("Question.")), *said[:1]))
+    said = [node.astext() for node in doctree.findall(nodes.paragraph)] or [app.config.project]
+    about = first_sentence(next((text for text in said if text.startswith("Question.")), said[0]))
     base, picture = app.config.html_baseurl, "_static/preview.jpg"
     told = {
         "description": about, "og:description": about, "og:type": "article", "og:site_name": app.config.project,
