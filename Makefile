@@ -45,7 +45,7 @@ install: $(INSTALLED) ## Build .venv and nothing else
 figures: $(INSTALLED) ## Run all notebooks, leave results under paper_figures/DATA/PROFILE
 	$(PYTHON) -m f3amd_companion figures --data $(DATA) --profile $(PROFILE)
 
-smoke: $(INSTALLED) ## Run all notebooks in a few minutes, leave results under runs/DATA/smoke
+smoke: $(INSTALLED) ## Run all notebooks at their smallest, leave results under runs/DATA/smoke
 	$(PYTHON) -m f3amd_companion figures --data $(DATA) --profile smoke
 
 course: $(INSTALLED) ## Run the notebooks of the course on samplers (no data, nothing stored)
