@@ -79,7 +79,7 @@ def test_nothing_is_done_after_what_is_unfinished(tmp_path, monkeypatch):
     made = iter((("weights",), None, ("weights",)))
     monkeypatch.setattr(campaign, "_trained", lambda *_, **__: next(made))
     monkeypatch.setattr(campaign, "run_record", lambda **_: {})
-    monkeypatch.setattr(campaign, "compile_steps", lambda *_: None)
+    monkeypatch.setattr(campaign, "compiled_steps", lambda *_: None)
     monkeypatch.setattr(campaign, "_laid_out", lambda *_: (None, None))
     prepared = SimpleNamespace(packed=None)
     legs = campaign.run_campaign(prepared, None, folder=tmp_path, snapshots=queue()[:3])
@@ -274,7 +274,7 @@ def minutes(packed, monkeypatch, tmp_path):
     monkeypatch.setattr(measurements, "compile_steps", lambda *_: None)
     monkeypatch.setattr(measurements, "planned_memory", lambda *_: 0)
     monkeypatch.setattr(measurements, "_TRAINED", ("F3AMD-FNO-32",))
-    monkeypatch.setattr(measurements, "_training_call", lambda *_: work("training") or (lambda: None))
+    monkeypatch.setattr(measurements, "training_call", lambda *_: work("training") or (lambda: None))
     trained = functools.cache(lambda: work("classifier"))  # kept, as the real one is
     monkeypatch.setattr(measure, "protocol_of", lambda *_: trained() or judges)
     monkeypatch.setattr(campaign, "_measured", measured)

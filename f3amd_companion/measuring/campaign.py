@@ -24,7 +24,7 @@ import itertools
 import logging
 import time
 from collections import ChainMap
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -38,7 +38,9 @@ import f3amd_lib
 from f3amd_companion.measuring.fingerprint import likeness_of_readings, real_rows, walk_rows, window_rows
 from f3amd_companion.measuring.paper_tables import beside_paper
 from f3amd_companion.measuring.runner import Records, records_folder
+from f3amd_companion.measuring.times import compiled_steps, training_call
 from f3amd_companion.speed.machine import device_name, matmul_precision, prepared_at_once
+from f3amd_companion.speed.timing import take_turns
 from f3amd_lib.data.windows import WindowSet
 from f3amd_lib.ground.files import read_toml
 from f3amd_lib.ground.names import check_known
@@ -56,7 +58,7 @@ from f3amd_lib.papers.printed import SCHEMAS, printed_tables
 from f3amd_lib.rollout.rollout import MotionGenerator
 from f3amd_lib.training.checkpoints import TrainedModel, load_model, save_model
 from f3amd_lib.training.denoising_task import DenoisingTask
-from f3amd_lib.training.optimise import compile_steps, held_out_terms, initial_state, restore_state
+from f3amd_lib.training.optimise import held_out_terms, restore_state
 from f3amd_lib.training.pipeline import ModelFiles, PreparedData, as_trained, set_aside_run, train_in_legs
 from f3amd_lib.training.recipe import TrainingConfig, paper_recipe
 
@@ -238,10 +240,14 @@ def chosen(snapshots: Iterable[tuple[Run, int]], only: Collection[str]) -> list[
     return [(run, windows) for run, windows in snapshots if not only or not run.names.isdisjoint(only)]
 
 
-def longest_first(snapshots: Iterable[tuple[Run, int]]) -> list[tuple[Run, int]]:
+def _longest(snapshots: Iterable[tuple[Run, int]]) -> dict[Run, int]:
+    """Return run -> windows of its last snapshot."""
+    return dict(sorted(snapshots, key=lambda snapshot: snapshot[1]))
+
+
+def longest_first(snapshots: Sequence[tuple[Run, int]]) -> list[tuple[Run, int]]:
     """Return the snapshots of a queue, longest runs first; those of a run stay in their order."""
-    snapshots = list(snapshots)
-    longest = dict(sorted(snapshots, key=lambda snapshot: snapshot[1]))
+    longest = _longest(snapshots)
     return sorted(snapshots, key=lambda snapshot: -longest[snapshot[0]])
 
 
@@ -297,11 +303,7 @@ def run_campaign(
             real = real_rows(prepared.packed, clips, window=prepared.window)
             records.put(table, {"run": "real", "windows": 0}, real.assign(model="real", weights=""))
     elif jax.config.jax_compilation_cache_dir:
-
-        def compiled(run: Run) -> None:
-            with matmul_precision(precision):
-                compile_steps(_laid_out(prepared, run, batch_size)[1], 50)
-
+        compiled = lambda run: compiled_steps(_laid_out(prepared, run, batch_size)[1], 50, precision)
         for program in prepared_at_once(compiled, dict.fromkeys(run for run, _ in snapshots)).values():
             program()
     for run, windows in snapshots:
@@ -433,18 +435,13 @@ def own_queue(reading: str, num_windows: int, seed: int = 0) -> list[tuple[Run, 
     return [(run, max(1, num_windows // part)) for run in runs for part in (10, 3, 1)]
 
 
-def hours_of(prepared: PreparedData, snapshots, batch_size: int, precision: str = "float32", chunk: int = 10) -> dict:
-    """Return the hours that each run's training would take here, by name: `chunk` steps are timed, after as many."""
+def hours_of(prepared: PreparedData, snapshots, batch_size: int, precision: str = "float32") -> dict:
+    """Return the hours that each run's training would take here, by name: ten steps are timed, after as many."""
     hours = {}
-    for run, windows in sorted(snapshots, key=lambda snapshot: snapshot[1]):  # the longest last
+    for run, windows in _longest(snapshots).items():
         task = _laid_out(prepared, run, batch_size)[1]
-        if run.name not in hours:
-            with matmul_precision(precision):
-                state, program = initial_state(task), compile_steps(task, chunk)
-            for _ in range(2):
-                started = time.perf_counter()
-                state = jax.block_until_ready(program(task, state)[0])
-            seconds = (time.perf_counter() - started) / chunk
+        ten_steps = training_call(task, compiled_steps(task, 10, precision)[0])
+        seconds = take_turns({run: ten_steps}, min_rounds=1, warmup=1)[run].median / 10
         hours[run.name] = seconds * windows / task.config.batch_size / 3600.0
     return hours
 

@@ -257,9 +257,9 @@ def measure_training_time(
         return None
     recipe = partial(short_recipe, num_steps=steps, batch_size=batch_size, seed=profile.seed)
     tasks = {name: prepared.task(name, recipe(name)) for name in _TRAINED}
-    programs = prepared_at_once(lambda name: _compiled(tasks[name], chunk, precision), _TRAINED)
+    programs = prepared_at_once(lambda name: compiled_steps(tasks[name], chunk, precision), _TRAINED)
     compiled = {name: program() for name, program in tqdm(programs.items(), unit="compiled")}
-    calls = {name: _training_call(tasks[name], program) for name, (program, _) in compiled.items()}
+    calls = {name: training_call(tasks[name], program) for name, (program, _) in compiled.items()}
     timings = take_turns(calls, min_rounds=-(-steps // chunk), min_seconds=float("inf"), warmup=2, progress=True)
     windows, circumstances, rows = prepared.windows("train").num_windows, _circumstances(), []
     for row, (name, timing) in zip(named, timings.items(), strict=True):
@@ -271,14 +271,14 @@ def measure_training_time(
     return records.path("training_time")
 
 
-def _compiled(task: DenoisingTask, chunk: int, precision: str):
+def compiled_steps(task: DenoisingTask, chunk: int, precision: str):
     """Return (program of `chunk` steps, seconds that compiling took)."""
     started = time.perf_counter()
     with matmul_precision(precision):  # here: what a caller sets does not reach other threads
         return compile_steps(task, chunk), time.perf_counter() - started
 
 
-def _training_call(task: DenoisingTask, program):
+def training_call(task: DenoisingTask, program):
     """Return a function that trains on for the steps of a compiled program and waits."""
     state = initial_state(task)
 
