@@ -6,6 +6,7 @@ import json
 
 import pandas as pd
 import pytest
+from f3amd_notebooks.stored_result import running_times
 
 from f3amd_companion.ledger import equation_map as map_module
 from f3amd_companion.ledger.equation_map import (
@@ -15,7 +16,6 @@ from f3amd_companion.ledger.equation_map import (
     equations_markdown,
     mentioned_equations,
     notebook_sections,
-    running_times,
 )
 from f3amd_lib.ground import papers
 from f3amd_lib.ground.profiles import repository_root

@@ -12,7 +12,7 @@ from builders import captioned_walks
 
 from f3amd_companion.__main__ import main
 from f3amd_companion.ledger import model_cards
-from f3amd_companion.ledger.quality_tables import measured_table
+from f3amd_companion.ledger.model_cards import measured_table
 from f3amd_lib.ground.profiles import repository_root
 from f3amd_lib.ground.stored import committed_table
 from f3amd_lib.ground.tables import fill_tables

@@ -3,8 +3,8 @@
 import pandas as pd
 import pytest
 from builders import refused
+from f3amd_notebooks.quality_tables import BAR_MODELS, quality_bars
 
-from f3amd_companion.ledger.quality_tables import BAR_MODELS, quality_bars
 from f3amd_companion.measuring.measure import ONE_STEP_MODELS
 from f3amd_lib.ground.profiles import load_profile
 

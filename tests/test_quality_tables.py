@@ -3,15 +3,8 @@
 import numpy as np
 import pandas as pd
 import pytest
+from f3amd_notebooks.quality_tables import FIGURES, NOT_MEASURED, PAPER_SOURCE, QUALITY_TABLES, beside_paper, of_queue
 
-from f3amd_companion.ledger.quality_tables import (
-    FIGURES,
-    NOT_MEASURED,
-    PAPER_SOURCE,
-    QUALITY_TABLES,
-    beside_paper,
-    of_queue,
-)
 from f3amd_lib.ground.papers import load_paper_table
 from f3amd_lib.networks import presets
 

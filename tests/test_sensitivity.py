@@ -6,14 +6,9 @@ import numpy as np
 import pandas as pd
 import pytest
 from builders import packed_from, refused, straight_motion, wandering_motion
+from f3amd_notebooks.rank_agreement import rank_agreement
 
-from f3amd_companion.measuring.sensitivity import (
-    foot_spectrum,
-    graded_corruptions,
-    rank_agreement,
-    settling,
-    summarise_corruptions,
-)
+from f3amd_companion.measuring.sensitivity import foot_spectrum, graded_corruptions, settling, summarise_corruptions
 from f3amd_lib.measures.protocol import Protocol
 
 SPAN = 20

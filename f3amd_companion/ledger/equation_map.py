@@ -25,7 +25,6 @@ import pandas as pd
 
 from f3amd_lib.ground.papers import load_paper_file, paper_folders
 from f3amd_lib.ground.profiles import repository_root
-from f3amd_lib.ground.records import read_table
 from f3amd_lib.ground.tables import compact_table
 
 _DEFAULT = "f3amd"  # whose equations are meant where no paper is named
@@ -244,33 +243,6 @@ def _notebook_of(root: Path, section: str) -> Path:
     """Return the notebook of a section by its number: "2.3" is in 02_*.ipynb, "C4.1" in course/04_*.ipynb."""
     number = int(section.lstrip("C").split(".")[0])
     return next((root / "notebooks" / ("course" if section[0] == "C" else "")).glob(f"{number:02d}_*.ipynb"))
-
-
-def running_times(*, root=None) -> pd.DataFrame:
-    """Collect how long each notebook ran, from the records of complete runs.
-
-    Args:
-      root: a checkout, by default the one in use. Read are `run_summary.csv` and its record in
-        `paper_figures/<data set>/<profile>/tables/`, which a run of all notebooks leaves there.
-
-    Returns:
-      notebook, and a column for each record, "synthetic, laptop, 2 CPU cores": seconds of wall
-      time, to a whole second. A notebook that did not exist when a record was made is a missing
-      value. Profiles and machines without a record have no column.
-
-    Raises:
-      ValueError: if a summary is not the one its record describes.
-    """
-    root = Path(root or repository_root())
-    columns = {}
-    for path in sorted((root / "paper_figures").glob("*/*/tables/run_summary.csv")):
-        summary, record = read_table(path)
-        where = f"{record['cores']} CPU cores" if record["device_platform"] == "cpu" else record["device_kind"]
-        finished = summary[summary["finished"]].set_index("notebook")["seconds"]
-        seconds = finished.rename(lambda name: name.removesuffix(".ipynb")).round().astype("Int64")
-        columns[f"{record['dataset']}, {record['profile']}, {where}"] = seconds
-    names = [path.stem for path in sorted((root / "notebooks").glob("[0-9][0-9]_*.ipynb"))]
-    return pd.DataFrame(columns, index=pd.Index(names, name="notebook")).reset_index()
 
 
 if __name__ == "__main__":

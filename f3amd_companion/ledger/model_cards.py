@@ -10,23 +10,22 @@ from __future__ import annotations
 import hashlib
 import logging
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import jax
 import pandas as pd
 
-from f3amd_companion.ledger.quality_tables import figure_column, measured_table
 from f3amd_lib.ground.files import read_toml, write_whole
 from f3amd_lib.ground.names import counted_cores
 from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.ground.profiles import repository_root
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.ground.stored import committed_table
-from f3amd_lib.ground.tables import fill_tables, markdown_table
+from f3amd_lib.ground.tables import figure_text, fill_tables, markdown_table
 from f3amd_lib.ground.trees import describe, weights_digest
 from f3amd_lib.measures.distributions import intervals_over_repeats
-from f3amd_lib.measures.registry import METRICS, SHOWN
+from f3amd_lib.measures.registry import METRICS, SHOWN, Metric
 from f3amd_lib.networks.presets import find_preset
 from f3amd_lib.papers.printed import SCHEMAS
 from f3amd_lib.text.judge.text_judge import load_judge
@@ -39,6 +38,42 @@ log = logging.getLogger("f3amd")
 _CARDS = read_toml(Path(__file__).with_name("cards.toml"))
 _OF_HANDS = ["motions", "asked_hand", "other_hand", "both_hands", "no_hand"]
 _OF_JUDGE = ["text_FID", "R_precision_1", "R_precision_3", "matching_distance"]
+
+
+MEASURED_COLUMNS = pd.read_csv(Path(__file__).with_name("results_columns.csv"))
+"""Headings of the columns of docs/results.md, with their model and steps."""
+
+
+def measured_table(quality: pd.DataFrame, window: int = 32) -> str:
+    """Render the table of what was measured on real motion, our own figures alone.
+
+    Args:
+      quality: from `protocol.summarise`.
+      window: of the models, frames.
+
+    Returns:
+      Markdown: means with 95 % intervals; a figure that a column does not have is a dash.
+    """
+    own = quality[quality["window_frames"] == window]
+    shown = SHOWN["results"]
+    columns = {"": ["style coverage (%)" if metric.name == "style_coverage" else metric.title for metric in shown]}
+    for title, model, steps in MEASURED_COLUMNS.itertuples(index=False):
+        columns[title] = figure_column(own[(own["model"] == model) & (own["steps"] == steps)], shown, fixed=True)
+    return markdown_table(pd.DataFrame(columns))
+
+
+def figure_column(rows: pd.DataFrame, metrics: Sequence[Metric], *, fixed: bool = False) -> list[str]:
+    """Write metrics of one system, a dash for one that it lacks.
+
+    Args:
+      rows: tidy, the system's own: metric, value, low, high. Of two of one metric the first counts.
+      metrics: which, in this order.
+      fixed: each with as many decimals as the registry says, in place of four digits.
+    """
+    figures = rows.drop_duplicates("metric").set_index("metric")[["value", "low", "high"]]
+    figures = figures.reindex([metric.name for metric in metrics]).to_numpy()
+    return [figure_text(*figure, metric.decimals if fixed else None)
+            for metric, figure in zip(metrics, figures, strict=True)]  # fmt: skip
 
 
 def _figures(measured: pd.DataFrame, real: pd.DataFrame) -> pd.DataFrame:

@@ -13,6 +13,8 @@ import unicodedata
 from collections.abc import Mapping
 from pathlib import Path
 
+import numpy as np
+
 ARROWS = {"down": " ↓", "up": " ↑"}
 
 
@@ -132,6 +134,30 @@ def markdown_table(frame, *, digits: int = 3) -> str:
 def compact_table(frame) -> str:
     """Render a table as `markdown_table` does, without columns of blanks, so that a changed cell is a changed line."""
     return re.sub(r" {2,}", " ", re.sub(r"-{4,}", "---", markdown_table(frame)))
+
+
+def figure_text(value: float, low: float = np.nan, high: float = np.nan, decimals: int | None = None) -> str:
+    """Write a mean with its interval: "7.386 ± 0.121", three decimals or four digits.
+
+    Args:
+      value: the mean; NaN gives a dash.
+      low, high: 95 % interval, symmetric about the mean as Student's t gives it; NaN (a single
+        repeat) leaves it out.
+      decimals: so many in place of those.
+
+    Raises:
+      ValueError: for an interval that does not hold its mean in the middle.
+    """
+    if np.isnan(value):
+        return "–"
+    decimals = max(0, 3 - int(np.log10(max(abs(value), 1.0)))) if decimals is None else decimals
+    text = f"{value:.{decimals}f}"
+    if np.isnan(low) or np.isnan(high):
+        return text
+    half = 0.5 * (high - low)
+    if half < 0 or not np.isclose(value - low, half, rtol=1e-3, atol=1e-9):
+        raise ValueError(f"{value} is not in the middle of its interval, {low} to {high}")
+    return f"{text} ± {half:.{decimals}f}"
 
 
 def metric_heading(metric: str, unit: str = "", better: str = "") -> str:

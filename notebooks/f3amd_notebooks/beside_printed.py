@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import pandas as pd
-from f3amd_lib.ground.papers import has_paper_file, load_paper_file, paper_folders
+from f3amd_lib.ground.papers import has_paper_file, load_paper_file, load_paper_table, paper_folders
 from f3amd_lib.ground.profiles import runs_dir
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.ground.stored import committed_table, measured_table
@@ -86,3 +86,57 @@ def whose_table(paper: str, number: str, *shown: str) -> str:
     if record is None or not path.is_file():
         return caption
     return f"{caption}\n\n{markdown_table(read_table(path)[0], digits=3)}\n\n*Figures: {WHOSE['yours']}.*"
+
+
+def times_beside_paper(table: pd.DataFrame, number: int, device: str) -> pd.DataFrame:
+    """Lay our synthesis times beside a table of the paper.
+
+    Args:
+      table: `synthesis_time`, the fastest implementation of each framework.
+      number: of the paper's table: 1, 4 or 7.
+      device: "CPU" or "GPU", for both sides. The paper's machines are others than ours.
+
+    Returns:
+      Columns model, window_frames, steps, characters, paper (ms), ours (ms), low, high, framework
+      and way; a row for each cell of the paper's table, ours NaN where nothing was measured.
+
+    Raises:
+      ValueError: for another table.
+    """
+    if number not in (1, 4, 7):
+        raise ValueError(f"table {number} holds no synthesis times by characters: use 1, 4 or 7")
+    paper = load_paper_table(number)
+    paper = paper[paper["device"] == device].rename(columns={"value": "paper"})
+    asked = paper["model"].str.contains("PyTorch").map({True: "torch", False: "jax"})
+    paper = paper.assign(asked=asked, preset=paper["model"].str.replace(r" \((JAX|PyTorch)\)", "", regex=True))
+    ours = table[table["device"] == device].rename(columns={"model": "preset", "value": "ours"})
+    ours, keys = ours.assign(asked=ours["framework"]), ["window_frames", "steps", "characters"]
+    told = ["ours", "low", "high", "framework", "way"]
+    matched = ["preset", "asked", *keys]
+    joined = paper[["model", "paper", *matched]].merge(ours[[*matched, *told]], how="left", on=matched)
+    return joined[["model", *keys, "paper", *told]]
+
+
+def training_beside_paper(table: pd.DataFrame) -> pd.DataFrame:
+    """Lay our training times beside the paper's Table 2.
+
+    Epochs differ in length (other data), so that what can be compared is the quotient over CAMDM.
+
+    Args:
+      table: `training_time`.
+
+    Returns:
+      Columns model, window_frames, paper_minutes, paper_over_camdm, our_minutes, our_over_camdm,
+      seconds_per_step, batch_size, device.
+    """
+    paper = load_paper_table(2)[["model", "window_frames", "value"]]
+    paper = paper.rename(columns={"value": "paper_minutes"})
+    ours = table[["model", "window_frames", "epoch_minutes", "value", "batch_size", "device"]]
+    ours = ours.rename(columns={"epoch_minutes": "our_minutes", "value": "seconds_per_step"})
+    joined = paper.merge(ours, how="left", on=["model", "window_frames"])
+    for name in ("paper", "our"):
+        minutes = f"{name}_minutes"
+        camdm = joined[joined["model"] == "CAMDM"].set_index("window_frames")[minutes]
+        quotient = joined[minutes] / joined["window_frames"].map(camdm)
+        joined.insert(joined.columns.get_loc(minutes) + 1, f"{name}_over_camdm", quotient)
+    return joined

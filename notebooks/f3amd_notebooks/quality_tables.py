@@ -8,17 +8,16 @@ disk but the paper's numbers.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
-
 from f3amd_lib.ground.names import row_label
 from f3amd_lib.ground.papers import load_paper_table
-from f3amd_lib.ground.tables import ARROWS, markdown_table, metric_heading
+from f3amd_lib.ground.tables import ARROWS, figure_text, markdown_table, metric_heading
 from f3amd_lib.measures.distributions import intervals_over_repeats
-from f3amd_lib.measures.registry import SHOWN, Metric
+from f3amd_lib.measures.registry import SHOWN
 from f3amd_lib.networks import presets
 
 QUALITY_TABLES = (3, 5, 6, 8, 9, 10, 11, 12)
@@ -38,44 +37,6 @@ NOTE = (
 
 
 _KEYS = ["model", "window_frames", "steps", "metric"]
-
-
-def figure_text(value: float, low: float = np.nan, high: float = np.nan, decimals: int | None = None) -> str:
-    """Write a mean with its interval: "7.386 ± 0.121", three decimals or four digits.
-
-    Args:
-      value: the mean; NaN gives a dash.
-      low, high: 95 % interval, symmetric about the mean as Student's t gives it; NaN (a single
-        repeat) leaves it out.
-      decimals: so many in place of those.
-
-    Raises:
-      ValueError: for an interval that does not hold its mean in the middle.
-    """
-    if np.isnan(value):
-        return "–"
-    decimals = max(0, 3 - int(np.log10(max(abs(value), 1.0)))) if decimals is None else decimals
-    text = f"{value:.{decimals}f}"
-    if np.isnan(low) or np.isnan(high):
-        return text
-    half = 0.5 * (high - low)
-    if half < 0 or not np.isclose(value - low, half, rtol=1e-3, atol=1e-9):
-        raise ValueError(f"{value} is not in the middle of its interval, {low} to {high}")
-    return f"{text} ± {half:.{decimals}f}"
-
-
-def figure_column(rows: pd.DataFrame, metrics: Sequence[Metric], *, fixed: bool = False) -> list[str]:
-    """Write metrics of one system, a dash for one that it lacks.
-
-    Args:
-      rows: tidy, the system's own: metric, value, low, high. Of two of one metric the first counts.
-      metrics: which, in this order.
-      fixed: each with as many decimals as the registry says, in place of four digits.
-    """
-    figures = rows.drop_duplicates("metric").set_index("metric")[["value", "low", "high"]]
-    figures = figures.reindex([metric.name for metric in metrics]).to_numpy()
-    return [figure_text(*figure, metric.decimals if fixed else None)
-            for metric, figure in zip(metrics, figures, strict=True)]  # fmt: skip
 
 
 def beside_paper(table: int, quality: pd.DataFrame, dataset_label: str) -> pd.DataFrame:
@@ -181,28 +142,6 @@ def quality_markdown(table: int, quality: pd.DataFrame, dataset_label: str) -> s
     title += f", windows of {frames[0]} frames." if len(frames) == 1 else "."
     note = f"{NOTE} {about['note']}".strip()
     return f"{title}\n\n{markdown_table(wide_rows(rows))}\n*{note}*\n"
-
-
-MEASURED_COLUMNS = pd.read_csv(Path(__file__).with_name("results_columns.csv"))
-"""Headings of the columns of docs/results.md, with their model and steps."""
-
-
-def measured_table(quality: pd.DataFrame, window: int = 32) -> str:
-    """Render the table of what was measured on real motion, our own figures alone.
-
-    Args:
-      quality: from `protocol.summarise`.
-      window: of the models, frames.
-
-    Returns:
-      Markdown: means with 95 % intervals; a figure that a column does not have is a dash.
-    """
-    own = quality[quality["window_frames"] == window]
-    shown = SHOWN["results"]
-    columns = {"": ["style coverage (%)" if metric.name == "style_coverage" else metric.title for metric in shown]}
-    for title, model, steps in MEASURED_COLUMNS.itertuples(index=False):
-        columns[title] = figure_column(own[(own["model"] == model) & (own["steps"] == steps)], shown, fixed=True)
-    return markdown_table(pd.DataFrame(columns))
 
 
 # ------------------------------------------------------- rollouts beside real clips, a column a system
