@@ -39,10 +39,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this tree's libr
 sys.path.insert(1, str(Path(__file__).resolve().parents[1] / "notebooks"))
 
 from f3amd_notebooks.beside_printed import beside_printed, times_beside_paper, training_beside_paper
+from f3amd_notebooks.equation_map import equation_map
 from f3amd_notebooks.quality_tables import QUALITY_TABLES, of_queue, quality_markdown
 
 from f3amd_companion.ledger.claims import judge_claims, ledger, ledger_markdown
-from f3amd_companion.ledger.equation_map import equation_map
 from f3amd_companion.ledger.model_cards import card_of, committed_quality, measured_table
 from f3amd_companion.measuring.consistency_task import distil
 from f3amd_companion.measuring.text_tables import PAPERS

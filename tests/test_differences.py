@@ -6,8 +6,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
-
-from f3amd_companion.ledger.equation_map import notebook_sections
+from f3amd_notebooks.equation_map import notebook_sections
 
 ROOT = Path(__file__).resolve().parents[1]
 TEXT = (ROOT / "docs/differences.md").read_text(encoding="utf-8")

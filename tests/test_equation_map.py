@@ -6,10 +6,8 @@ import json
 
 import pandas as pd
 import pytest
-from f3amd_notebooks.stored_result import running_times
-
-from f3amd_companion.ledger import equation_map as map_module
-from f3amd_companion.ledger.equation_map import (
+from f3amd_notebooks import equation_map as map_module
+from f3amd_notebooks.equation_map import (
     equation_labels,
     equation_map,
     equations_in_name,
@@ -17,6 +15,8 @@ from f3amd_companion.ledger.equation_map import (
     mentioned_equations,
     notebook_sections,
 )
+from f3amd_notebooks.stored_result import running_times
+
 from f3amd_lib.ground import papers
 from f3amd_lib.ground.profiles import repository_root
 from f3amd_lib.ground.records import run_record, write_table
@@ -134,7 +134,7 @@ def test_every_numbered_equation_of_a_paper_has_code_or_a_reason(paper):
 
 def test_the_committed_page_is_what_the_code_says():
     page = (repository_root() / "docs/equations.md").read_text(encoding="utf-8")
-    assert page == equations_markdown(), "write it again: python -m f3amd_companion.ledger.equation_map"
+    assert page == equations_markdown(), "write it again: python -m f3amd_notebooks.equation_map"
     for paper in papers.paper_folders():
         about = papers.load_paper_file("paper", paper)
         table = page.split(f"## {about['name']}\n")[1].split("\n## ")[0]

@@ -4,10 +4,9 @@ Docstrings of the library say which equation of a paper a function implements: "
 Eqs 2-4", or without a name, which means F3AMD ("Eq. 9", "Appendix F"). A paper's name and its
 equations stand in its `paper.toml`. This module collects them, together with the tests and the sections of
 notebooks that mention the same equation, and the figures that these sections draw. Nothing is
-imported for it: source files are parsed. How long a notebook runs is read off the records of
-complete runs.
+imported for it: source files are parsed.
 
-`python -m f3amd_companion.ledger.equation_map` writes the maps of all papers to docs/equations.md.
+`python -m f3amd_notebooks.equation_map` writes the maps of all papers to docs/equations.md.
 """
 
 from __future__ import annotations
@@ -22,7 +21,6 @@ from pathlib import Path
 from textwrap import indent
 
 import pandas as pd
-
 from f3amd_lib.ground.papers import load_paper_file, paper_folders
 from f3amd_lib.ground.profiles import repository_root
 from f3amd_lib.ground.tables import compact_table
