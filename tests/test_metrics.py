@@ -165,7 +165,7 @@ def test_undefined_ratios_are_nan_not_errors():
     still = np.tile(POSE, (2 * WINDOW, 1, 1))
     assert np.isnan(metrics.smoothness(still))
     assert np.isnan(metrics.coherence(still))
-    assert np.isnan(metrics.foot_sliding(still, (3, 4))[0])
+    assert np.isnan(metrics.foot_sliding(still, SKELETON)[0])
     assert np.isnan(metrics.smoothness(glide()))  # steady: the root does not accelerate
     assert metrics.joint_acceleration(still) == 0.0
 
@@ -190,13 +190,13 @@ def test_two_centimetres_a_frame_at_one_metre_a_second():
 
 def test_floor_is_the_lowest_toe_unless_given():
     resting_high = slider(rest=0.0425)  # Bandai's toe joint
-    assert metrics.foot_sliding(resting_high, (3, 4)) == pytest.approx((0.6, 0.5))
-    assert metrics.foot_sliding(resting_high, (3, 4), floor_shift=0.0425) == pytest.approx((0.6, 0.5))
-    assert metrics.foot_sliding(resting_high, (3, 4), floor_shift=0.0) == (0.0, 0.0)
+    assert metrics.foot_sliding(resting_high, SKELETON) == pytest.approx((0.6, 0.5))
+    assert metrics.foot_sliding(resting_high, SKELETON, floor_shift=0.0425) == pytest.approx((0.6, 0.5))
+    assert metrics.foot_sliding(resting_high, SKELETON, floor_shift=0.0) == (0.0, 0.0)
 
 
 def test_planted_foot_does_not_slide():
-    value, share = metrics.foot_sliding(slider(slide=0.0), (3, 4))
+    value, share = metrics.foot_sliding(slider(slide=0.0), SKELETON)
     assert value == 0.0 and share == pytest.approx(0.5)
 
 
@@ -301,12 +301,12 @@ def test_nan_and_wrong_shape_are_refused(metric):
     broken = glide()
     broken[7, 2, 1] = np.nan
     refused("not finite at frame 7, joint 2", metric, broken)
-    refused(r"\[..., T, J, 3\]", metric, np.zeros((128, 15)))
+    refused(r"\[frame, joint, 3\]", metric, np.zeros((128, 15)))
 
 
 def test_paths_that_do_not_fit_are_refused():
-    refused(r"128 frames .* got \(100, 2\)", metrics.trajectory_error, glide(), np.zeros((100, 2)), WINDOW)
+    refused(r"\[128, 2\] .* got \(100, 2\)", metrics.trajectory_error, glide(), np.zeros((100, 2)), WINDOW)
     refused("do not fill a window", metrics.trajectory_error, glide(20), np.zeros((20, 2)), WINDOW)
     refused("finite", metrics.direction_error, np.full(64, np.nan), np.zeros(64), WINDOW)
     refused("window must be", metrics.ird_excess, glide(), 1)
-    refused(r"128 frames .* got \(100, 1\)", metrics.camdm_orientation_error, np.zeros(128), np.zeros(100))
+    refused(r"\[128, 1\] .* got \(100, 1\)", metrics.camdm_orientation_error, np.zeros(128), np.zeros(100))

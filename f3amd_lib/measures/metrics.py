@@ -15,6 +15,7 @@ for that character, and no reason to lose the others. Average with `numpy.nanmea
 
 import numpy as np
 
+from f3amd_lib.ground.arrays import finite_array
 from f3amd_lib.motion.root_paths import RootPath
 from f3amd_lib.motion.rotations import wrap_angle
 from f3amd_lib.motion.skeleton import Skeleton, facing_yaw
@@ -27,12 +28,7 @@ _STILL = 1e-6  # metres; a mean root step or acceleration under a micrometre is 
 
 def checked_positions(positions, least: int = 1) -> np.ndarray:
     """Return positions as float64, or say what is wrong with them."""
-    positions = np.asarray(positions, dtype=np.float64)
-    if positions.ndim < 3 or positions.shape[-1] != 3:
-        raise ValueError(f"positions must be [..., T, J, 3] in metres, got {positions.shape}")
-    if not np.all(np.isfinite(positions)):
-        *_, frame, joint, _ = (int(i) for i in np.argwhere(~np.isfinite(positions))[0])
-        raise ValueError(f"positions are not finite at frame {frame}, joint {joint}")
+    positions = finite_array("positions", positions, (*np.shape(positions)[:-3], "frame", "joint", 3))
     if positions.shape[-3] < least:
         raise ValueError(f"{positions.shape[-3]} frames; at least {least} needed")
     return positions
@@ -48,27 +44,17 @@ def _since_window_start(signal: np.ndarray, window: int) -> np.ndarray:
     return windows - windows[..., :1, :]
 
 
-def _checked_signal(what: str, signal, num_frames: int, width: int) -> np.ndarray:
-    """Return positions on the ground (width 2) or yaws (width 1) as float64, [..., T, width]."""
-    signal = np.asarray(signal, dtype=np.float64)
-    if signal.ndim < 2 or signal.shape[-2:] != (num_frames, width) or not np.all(np.isfinite(signal)):
-        raise ValueError(
-            f"{what} must be a RootPath of {num_frames} frames or finite [..., {num_frames}, {width}], "
-            f"got {signal.shape}"
-        )
-    return signal
-
-
 def _root_and_target(positions, path, least: int = 1) -> tuple[np.ndarray, np.ndarray]:
     """Return the root on the ground and where it was wanted, [..., T, 2] each."""
-    root = checked_positions(positions, least)[..., 0, [0, 2]]
-    return root, _checked_signal("path", getattr(path, "position", path), root.shape[-2], 2)
+    root, target = checked_positions(positions, least)[..., 0, [0, 2]], np.asarray(getattr(path, "position", path))
+    return root, finite_array("path", target, (*target.shape[:-2], root.shape[-2], 2))
 
 
 def _shown_and_wanted_yaw(yaw, path) -> tuple[np.ndarray, np.ndarray]:
     """Return the facing and the wanted facing, [..., T, 1] each."""
     shown, wanted = np.asarray(yaw)[..., None], np.asarray(getattr(path, "yaw", path))[..., None]
-    return _checked_signal("yaw", shown, shown.shape[-2], 1), _checked_signal("path", wanted, shown.shape[-2], 1)
+    checked = lambda name, signal: finite_array(name, signal, (*signal.shape[:-2], shown.shape[-2], 1))
+    return checked("yaw", shown), checked("path", wanted)
 
 
 def _ratio(numerator: np.ndarray, denominator: np.ndarray):
@@ -84,13 +70,10 @@ def _joint_and_root_change(positions, order: int) -> tuple[np.ndarray, np.ndarra
     return joints, np.linalg.norm(change[..., 0, [0, 2]], axis=-1).mean(axis=-1)
 
 
-def _toes_and_root_step(positions, toes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _toes_and_root_step(positions, skeleton: Skeleton) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return toe positions [..., T, 2, 3], their steps on the ground [..., T - 1, 2] and the root's mean one."""
     positions = checked_positions(positions, least=2)
-    toes, num_joints = list(toes.toes if isinstance(toes, Skeleton) else toes), positions.shape[-2]
-    if not all(0 <= joint < num_joints for joint in toes):
-        raise ValueError(f"toes {toes} are not among the {num_joints} joints of positions")
-    toe = positions[..., toes, :]
+    toe = positions[..., list(skeleton.toes), :]
     step = np.linalg.norm(np.diff(toe, axis=-3)[..., [0, 2]], axis=-1)
     root = np.linalg.norm(np.diff(positions[..., 0, [0, 2]], axis=-2), axis=-1).mean(axis=-1)
     return toe, step, root
@@ -213,7 +196,7 @@ def coherence(positions):
     return _ratio(*_joint_and_root_change(positions, 1))
 
 
-def foot_sliding(positions, toes, floor_shift=None, contact_height: float = CONTACT_HEIGHT):
+def foot_sliding(positions, skeleton: Skeleton, floor_shift=None, contact_height: float = CONTACT_HEIGHT):
     """Horizontal toe step while in contact over the root's horizontal step, and the contact share.
 
         mean over toe-frames in contact of || toe_{t+1} - toe_t ||_xz
@@ -223,7 +206,7 @@ def foot_sliding(positions, toes, floor_shift=None, contact_height: float = CONT
 
     Args:
       positions: [..., T, J, 3], metres, T >= 2.
-      toes: joint indices of the two toes (`skeleton.toes`), or a `Skeleton`.
+      skeleton: whose toes are looked at.
       floor_shift: height of a resting toe, metres, one number or one a character. None takes each
         character's own lowest toe, so that the lowest toe counts as 0. Give it where that is
         known (from real motion of the style), lest a single dip lift the floor's reference.
@@ -235,12 +218,12 @@ def foot_sliding(positions, toes, floor_shift=None, contact_height: float = CONT
       nowhere, so read the share beside it. NaN where the root stands still.
 
     Raises:
-      ValueError: for NaN, a wrong shape, toe indices out of range, or fewer than 2 frames.
+      ValueError: for NaN, a wrong shape, or fewer than 2 frames.
 
     Source: paper Appendix C (Foot Sliding, 1 cm). The text does not mention a lowering of the
     clip; CAMDM's code does it, and without it a toe joint that rests at 4 cm would never touch.
     """
-    toe, step, root = _toes_and_root_step(positions, toes)
+    toe, step, root = _toes_and_root_step(positions, skeleton)
     if floor_shift is None:
         floor = toe[..., 1].min(axis=(-2, -1))
     else:
@@ -433,7 +416,7 @@ def camdm_orientation_error(yaw, path):
     return _angle_error(angle, wanted, np.ones(angle.shape, dtype=bool))
 
 
-def camdm_foot_sliding(positions, toes):
+def camdm_foot_sliding(positions, skeleton: Skeleton):
     """CAMDM's foot sliding: as `foot_sliding` with the clip lowered, but for its last frame.
 
         mean over toe-frames in contact of s_t  /  mean_t || root_{t+1} - root_t ||_xz,
@@ -444,18 +427,18 @@ def camdm_foot_sliding(positions, toes):
 
     Args:
       positions: [..., T, J, 3], metres, T >= 2.
-      toes: joint indices of the two toes (`skeleton.toes`), or a `Skeleton`.
+      skeleton: whose toes are looked at.
 
     Returns:
       One ratio a character; 0 without any contact. NaN where the root stands still, where the code
       divides by 1 in its own unit.
 
     Raises:
-      ValueError: for NaN, a wrong shape, toe indices out of range, or fewer than 2 frames.
+      ValueError: for NaN, a wrong shape, or fewer than 2 frames.
 
     Source: the released CAMDM code.
     """
-    toe, step, root = _toes_and_root_step(positions, toes)
+    toe, step, root = _toes_and_root_step(positions, skeleton)
     contact = toe[..., 1] - toe[..., 1].min(axis=(-2, -1), keepdims=True) < CONTACT_HEIGHT
     slide = (step * contact[..., :-1, :]).sum(axis=(-2, -1)) / np.maximum(contact.sum(axis=(-2, -1)), 1)
     return _ratio(slide, root)
