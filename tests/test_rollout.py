@@ -168,8 +168,8 @@ def test_noise_levels_are_those_of_training_unless_told(trained):
     generator = MotionGenerator(tiny_trained(diffusion=levels), num_steps=3)
     np.testing.assert_array_equal(generator.sigmas, levels.grid(3))
     np.testing.assert_array_equal(MotionGenerator(trained, 4).sigmas, variance_exploding().grid(4))
-    chosen = MotionGenerator(trained, 4, schedule=variance_exploding(8.0, 1.0), spacing="uniform")
-    np.testing.assert_array_equal(chosen.sigmas, variance_exploding(8.0, 1.0).grid(4, "uniform"))
+    chosen = MotionGenerator(trained, 4, spacing="uniform")
+    np.testing.assert_array_equal(chosen.sigmas, variance_exploding().grid(4, "uniform"))
     refused("num_steps=0", MotionGenerator, trained, 0)
 
 

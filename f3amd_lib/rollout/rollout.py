@@ -13,12 +13,10 @@ import numpy as np
 
 from f3amd_lib.data.features import bend_path, center_window, num_channels, orthonormalise, path_condition
 from f3amd_lib.diffusion.samplers import SAMPLERS
-from f3amd_lib.diffusion.schedules import NoiseSchedule
 from f3amd_lib.ground.arrays import finite_array
 from f3amd_lib.ground.names import check_known, checked_seed
 from f3amd_lib.motion.root_paths import RootPath
 from f3amd_lib.networks.conditioning import Condition
-from f3amd_lib.networks.config import cast_network
 from f3amd_lib.rollout.blending import blend_rollout
 from f3amd_lib.rollout.generated import Rollout
 from f3amd_lib.rollout.rounds import sample_round
@@ -35,31 +33,25 @@ class MotionGenerator:
     Args:
       trained: a trained model.
       num_steps: steps a round (the paper: 8, 4, 2 or 1); an evaluation each, but for "heun".
-      schedule: noise levels; by default those the model was trained with.
-      spacing: where the steps lie, see the schedule's `grid`.
+      spacing: where the steps lie, see the `grid` of the schedule that the model was trained with.
       sampler: a name of `samplers.SAMPLERS`; by default the one that belongs to the schedule (F3AMD
         DDIM, CAMDM ancestral DDPM).
-      dtype: of the network's arithmetic; jnp.bfloat16 is faster where the hardware has it.
     """
 
     def __init__(
-        self, trained: TrainedModel, num_steps: int = 8, *, schedule: NoiseSchedule | None = None,
-        spacing: str = "endpoints", sampler: str | None = None, dtype=jnp.float32,
-    ):  # fmt: skip
+        self, trained: TrainedModel, num_steps: int = 8, *, spacing: str = "endpoints", sampler: str | None = None
+    ):
         self.trained = trained
         if num_steps > MOST_STEPS:
             raise ValueError(f"num_steps must be at most {MOST_STEPS}, got {num_steps}: more only take longer")
         self.num_steps = num_steps
-        schedule = schedule or trained.diffusion
-        self.sampler = sampler or schedule.sampler
+        self.sampler = sampler or trained.diffusion.sampler
         check_known(self.sampler, SAMPLERS, "sampler")
-        self.sigmas = schedule.grid(num_steps, spacing)
+        self.sigmas = trained.diffusion.grid(num_steps, spacing)
         # A walk that is told a low level from the first starts from noise alone all the same: of variance 1 in the
         # preserving state, and of 1 + sigma^2 in ours.
         self._start = float(np.hypot(1.0, self.sigmas[0])) if spacing == "leading" else None
-        self.dtype = jnp.dtype(dtype)
-        network = trained.network()
-        self._network = network if dtype == jnp.float32 else cast_network(network, dtype)
+        self._network = trained.network()
         self._run = jax.jit(self._rounds)
         self.sample = jax.jit(self.sample_window)  # compiled once for each number of rows
 
@@ -71,12 +63,8 @@ class MotionGenerator:
           condition: normalised.
           noise: standard normal numbers to start from, [B, T, C].
         """
-        condition = jax.tree.map(lambda leaf: leaf.astype(self.dtype), condition)
-        noise = None if noise is None else noise.astype(self.dtype)
-        x0_hat = sample_round(
-            self._network, condition, self.sigmas, key, noise=noise, start=self._start, sampler=self.sampler
-        )
-        return x0_hat.astype(jnp.float32)
+        how = {"noise": noise, "start": self._start, "sampler": self.sampler}
+        return sample_round(self._network, condition, self.sigmas, key, **how)
 
     def sample_window_each(self, keys, condition: Condition):
         """Sample one window for each character as if it were alone, [B, T, C]; keys [B]."""
