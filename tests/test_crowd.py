@@ -64,8 +64,8 @@ def content(folder):
 
 def close(first, second):
     """Whether two crowds hold the same characters, to the rounding of their arithmetic."""
-    for name in ("root", "rotations", "path", "style_index"):
-        one, two = (np.asarray(getattr(crowd, name)) for crowd in (first, second))
+    for name in ("root", "rotations", "path", "style"):
+        one, two = (np.asarray(crowd.rows[name]) for crowd in (first, second))
         # A step of float16 below 1 is at most 5e-4; the rest is float32 arithmetic.
         atol = {"root": 1e-4, "rotations": 2e-3}.get(name, 0.0)
         np.testing.assert_allclose(one.astype(float), two.astype(float), rtol=0, atol=atol)
@@ -93,8 +93,8 @@ def test_each_character_is_the_one_generated_alone_with_its_key(trained, generat
         place = slice(character % 4, character % 4 + 1)
         key = jax.random.fold_in(jax.random.key(5), character)
         alone = generate(*(array[place] for array in arrays), key)[0]
-        np.testing.assert_allclose(crowd.root[character], alone[:, :3], atol=1e-4)
-        sixes = np.asarray(crowd.rotations[character], float).reshape(FRAMES, -1)
+        np.testing.assert_allclose(crowd.rows["root"][character], alone[:, :3], atol=1e-4)
+        sixes = np.asarray(crowd.rows["rotations"][character], float).reshape(FRAMES, -1)
         np.testing.assert_allclose(sixes, alone[:, 3:], atol=2e-3)
 
 

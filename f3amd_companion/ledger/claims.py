@@ -1,4 +1,4 @@
-"""The claims ledger: what a paper says, judged from records: `python -m f3amd_companion.ledger.claims`.
+"""The claims ledger: what a paper says, judged from records: `f3amd claims`.
 
 Every claim is an entry of the paper's `claims.toml`: its sentence in our words, its place in the
 paper, what decides it, and its statements, each with its kind of judgement. A verdict
@@ -18,14 +18,12 @@ import inspect
 import json
 import logging
 import re
-import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
-import tyro
 
 from f3amd_companion.ledger import judgements as judging
 from f3amd_companion.ledger import theory
@@ -569,8 +567,3 @@ def main(accept: bool = False, paper: str | None = None) -> int:
         else:
             log.info("%s is up to date", path.relative_to(repository_root()))
     return status
-
-
-if __name__ == "__main__":
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
-    sys.exit(tyro.cli(main))

@@ -290,13 +290,11 @@ def _measure_walks(
 
 def measure_trained(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
     """Write down how many windows every model that has weights was trained with: `records/trained.csv`."""
-    names = models or available_models(profile)
-    trained = {name: obtain_model(prepared, profile, preset=name)[0] for name in names}
+    trained = _models(prepared, profile, models)
     sum_up = lambda row: {"trained": pd.DataFrame([{"metric": "windows", "value": trained[row["model"]].windows_seen}])}
     todo = [{"model": name, "window_frames": profile.window} for name in trained]
-    return _measure(
-        profile, _record(prepared, profile, "trained"), ["trained"], todo, sum_up, again=models, trained=trained
-    )
+    record = _record(prepared, profile, "trained")
+    return _measure(profile, record, ["trained"], todo, sum_up, again=models, trained=trained)
 
 
 def measure_sensitivity(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
@@ -383,10 +381,8 @@ def measure_gradient_norm(prepared: PreparedData, profile: Profile, models: Iter
     Returns:
       The table `records/gradient_norm.csv` (see `denoising.gradient_norm_by_sigma`), of `F3AMD-FNO-96` by default.
     """
-    trained, held_out = (
-        _models(prepared, profile, models or ["F3AMD-FNO-96"]),
-        prepared.windows(prepared.held_out_split),
-    )
+    trained = _models(prepared, profile, models or ["F3AMD-FNO-96"])
+    held_out = prepared.windows(prepared.held_out_split)
 
     def slope(row: Mapping) -> dict:
         model, recipe = trained[row["model"]], profile_recipe(profile, row["model"])

@@ -102,11 +102,9 @@ class PaperBench(Bench):
         crops = {"positions": real.positions[rows], "start": np.cumsum([0, *lengths]), "stored": stored}
         return replace(self, real=replace(real, **crops), seed=self.seed + repeat)
 
-    def captions(self, repeat: int) -> tuple[list[str], np.ndarray | None]:
-        """Return a caption of each clip, and their embeddings [N, W]."""
-        generator = np.random.default_rng([self.seed, repeat, 2])
-        told = [said[generator.integers(len(said))] for said in self.real.captions]
-        return told, self.pooled and self.pooled(told)
+    def pool(self, told: list[str]) -> np.ndarray | None:
+        """Return the embeddings of captions, [N, W], where a model is asked."""
+        return self.pooled and self.pooled(told)
 
     def shown(self) -> list[np.ndarray]:
         """Return what the judge sees of the real clips."""

@@ -102,7 +102,11 @@ class Bench:
         """Return a caption of each clip and their embeddings [N, W], drawn anew in each repeat."""
         generator = np.random.default_rng([self.seed, repeat, 2])
         told = [said[generator.integers(len(said))] for said in self.real.captions]
-        return told, embed_captions(told, self.encoder).pooled
+        return told, self.pool(told)
+
+    def pool(self, told: list[str]) -> np.ndarray:
+        """Return the embeddings of captions, [N, W]."""
+        return embed_captions(told, self.encoder).pooled
 
     def quality(self, make: Callable) -> pd.DataFrame:
         """Return metric, value, low and high of what `make(pooled [N, W], lengths [N], key)` makes, [N, L, J, 3]."""

@@ -154,40 +154,34 @@ class Crowd:
     Attributes:
       settings: what `crowd.json` says.
       skeleton: of all characters.
-      root: [B, F, 3], metres.
-      rotations: [B, F, J, 6], float16.
-      path: [B, F, 3], x, z in metres and facing in radians that were asked for.
-      style_index: [B], into `settings["styles"]`.
+      rows: of `crowd.npy`, [B].
     """
 
     settings: dict
     skeleton: Skeleton
-    root: np.ndarray
-    rotations: np.ndarray
-    path: np.ndarray
-    style_index: np.ndarray
+    rows: np.ndarray
 
     def __len__(self) -> int:
-        return len(self.root)
+        return len(self.rows)
 
     @property
     def num_frames(self) -> int:
         """Frames of every character, F."""
-        return self.root.shape[1]
+        return self.settings["num_frames"]
 
     def style(self, character: int) -> str:
         """Return a character's style."""
-        return self.settings["styles"][self.style_index[character]]
+        return self.settings["styles"][self.rows["style"][character]]
 
     def target(self, character: int) -> RootPath:
         """Return a character's target path."""
-        path = np.asarray(self.path[character], np.float64)
+        path = np.asarray(self.rows["path"][character], np.float64)
         return RootPath(path[:, :2], path[:, 2], self.settings["fps"])
 
     def motion(self, character: int) -> Motion:
         """Return a character's motion."""
-        root = np.asarray(self.root[character], np.float64)
-        rotations = np.asarray(self.rotations[character], np.float64)
+        root = np.asarray(self.rows["root"][character], np.float64)
+        rotations = np.asarray(self.rows["rotations"][character], np.float64)
         frames = np.concatenate([root, rotations.reshape(len(root), -1)], axis=-1)
         return motion_from_frames(self.skeleton, frames, self.settings["fps"], name=self.style(character))
 
@@ -254,7 +248,7 @@ def generate_crowd(
         "model": {
             "name": trained.name,
             "weights": weights_digest(trained.params),
-            "dtype": generator.dtype.name,
+            "dtype": "float32",
             "sampler": generator.sampler,
             "sigmas": np.asarray(generator.sigmas, np.float64).tolist(),
             **{name: trained.record.get(name) for name in ("dataset", "dataset_licence", "dataset_credit")},
@@ -335,8 +329,7 @@ def read_crowd(folder) -> Crowd:
         if finished != total:
             raise ValueError(f"only {finished} of {total} characters are finished; the same call goes on")
         skeleton = described_skeleton(settings, settings["offsets"])
-    rows = _open_rows(folder, settings)
-    return Crowd(settings, skeleton, *(rows[name] for name in rows.dtype.names))
+    return Crowd(settings, skeleton, _open_rows(folder, settings))
 
 
 def _paces(generator: MotionGenerator, characters: range, style_index, seed: int):

@@ -31,13 +31,13 @@ import itertools
 import numpy as np
 from scipy import ndimage, sparse
 from scipy.sparse.linalg import splu
-from scipy.spatial.transform import Rotation
 
 from f3amd_lib.data.features import frame_positions, world_frames
 from f3amd_lib.ground.arrays import finite_array
 from f3amd_lib.measures.walking import STEP_PROMINENCE, toe_positions
 from f3amd_lib.motion.anatomy import joint_chain
 from f3amd_lib.motion.curves import smooth_above, unit
+from f3amd_lib.motion.rotations import shortest_turn
 from f3amd_lib.motion.skeleton import Motion, Skeleton, contact_labels, global_rotations
 from f3amd_lib.rollout.generated import Rollout
 
@@ -230,13 +230,6 @@ def _plan_toe(leg, contact, floor: float, limit, fps: float):
 # -------------------------------------------------------------------------------------- the legs
 
 
-def _shortest_turn(first, second) -> np.ndarray:
-    """Return the smallest rotations that turn unit vectors [T, 3] into others, [T, 3, 3]."""
-    axis = np.cross(first, second)
-    angle = np.arctan2(np.linalg.norm(axis, axis=-1), (first * second).sum(axis=-1))
-    return Rotation.from_rotvec(unit(axis) * angle[:, None]).as_matrix()
-
-
 def knee_axes(leg, thigh_turn, across) -> np.ndarray:
     """Return the axis of each knee's bend, as the thigh sees it, [T, 3]; the longer, the more it bends.
 
@@ -289,8 +282,8 @@ def bend_leg(skeleton: Skeleton, chain, leg, turned, usual, line, reach) -> np.n
     axis = axis + straight * usual
     axis = unit(axis - (axis * thigh).sum(axis=-1, keepdims=True) * thigh)
     bent = np.cos(angle) * thigh + np.sin(angle) * np.cross(axis, thigh)
-    knee_turn = _shortest_turn(shank, bent)
-    hip_turn = _shortest_turn(unit(upper[:, None] * thigh + lower[:, None] * bent), unit(line))
+    knee_turn = shortest_turn(shank, bent)
+    hip_turn = shortest_turn(upper[:, None] * thigh + lower[:, None] * bent, line)
     parent, *own = (turned[:, joint] for joint in (skeleton.parents[chain[0]], *chain[:3]))
     frames = [parent, hip_turn @ own[0], hip_turn @ knee_turn @ own[1], own[2]]
     return np.stack([np.swapaxes(above, -1, -2) @ below for above, below in itertools.pairwise(frames)])

@@ -185,17 +185,13 @@ def seeded_inputs(config, batch: int) -> dict[str, np.ndarray]:
     """Return inputs to compare programs by, float32; of a mask the last quarter of each second sample is padding."""
     draw, shapes = np.random.default_rng(0), signature(config, batch).inputs
     inputs = {name: draw.normal(size=shape).astype(np.float32) for name, shape in shapes.items()}
-    for level in ("sigma", "time"):
-        if level in inputs:
-            inputs[level] = np.ones(batch, np.float32)
+    kept = {"sigma": np.ones(batch), "time": np.ones(batch), "guidance": np.linspace(5.0, 15.0, batch)}
     if "style" in inputs:
-        inputs["style"] = np.eye(config.num_styles, dtype=np.float32)[np.arange(batch) % config.num_styles]
+        kept["style"] = np.eye(config.num_styles)[np.arange(batch) % config.num_styles]
     if "mask" in inputs:
-        inputs["mask"] = np.ones(shapes["mask"], np.float32)
-        inputs["mask"][1::2, -(shapes["mask"][1] // 4 or 1) :] = 0
-    if "guidance" in inputs:
-        inputs["guidance"] = np.linspace(5.0, 15.0, batch, dtype=np.float32)
-    return inputs
+        kept["mask"] = np.ones(shapes["mask"])
+        kept["mask"][1::2, -(shapes["mask"][1] // 4 or 1) :] = 0
+    return inputs | {name: kept[name].astype(np.float32) for name in inputs if name in kept}
 
 
 def largest_difference(program: bytes, network, levels) -> float:
