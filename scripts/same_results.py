@@ -41,6 +41,7 @@ sys.path.insert(1, str(Path(__file__).resolve().parents[1] / "notebooks"))
 from f3amd_notebooks.beside_printed import beside_printed, times_beside_paper, training_beside_paper
 from f3amd_notebooks.equation_map import equation_map
 from f3amd_notebooks.quality_tables import QUALITY_TABLES, of_queue, quality_markdown
+from f3amd_notebooks.readings import readings_table
 
 from f3amd_companion.ledger.claims import judge_claims, ledger, ledger_markdown
 from f3amd_companion.ledger.model_cards import card_of, committed_quality, measured_table
@@ -71,7 +72,6 @@ from f3amd_lib.motion.root_paths import named_path
 from f3amd_lib.motion.skeleton import Motion, resample
 from f3amd_lib.motion.synthetic import STYLES, synthesize
 from f3amd_lib.networks.presets import PRESETS, Preset, build_config, find_family, find_preset, of_paper, table
-from f3amd_lib.papers.readings import readings_table
 from f3amd_lib.rollout.rollout import MotionGenerator
 from f3amd_lib.text.data.text_encoders import embed_captions, load_text_encoder
 from f3amd_lib.text.data.text_motions import text_motions

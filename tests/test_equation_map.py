@@ -15,13 +15,13 @@ from f3amd_notebooks.equation_map import (
     mentioned_equations,
     notebook_sections,
 )
+from f3amd_notebooks.readings import fill_reading, readings_table
 from f3amd_notebooks.stored_result import running_times
 
 from f3amd_lib.ground import papers
 from f3amd_lib.ground.profiles import repository_root
 from f3amd_lib.ground.records import run_record, write_table
 from f3amd_lib.networks.f3amd import F3AMDConfig
-from f3amd_lib.papers.readings import fill_reading, readings_table
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from builders import SKELETON, packed_from, refused, stiff_walk, walks_and_runs
-from f3amd_notebooks import shown
+from f3amd_notebooks import shown, walk_tables
 
 from f3amd_lib.data.features import world_frames
 from f3amd_lib.measures import real_clips
@@ -83,10 +83,10 @@ def rollout_of(motions, paths=None, window=WINDOW):
 
 def test_real_clips_and_rollouts_are_measured_alike(packed):
     clips = [4, 9]
-    real = real_clips.measure_clips(packed, clips, window=WINDOW)
+    real = walk_tables.measure_clips(packed, clips, window=WINDOW)
     motions = [packed.motion(clip) for clip in clips]
     paths = [real_clips.own_path(motion) for motion in motions]
-    again = real_clips.measure_rollout(rollout_of(motions, paths), packed.floor_shift[clips])
+    again = walk_tables.measure_rollout(rollout_of(motions, paths), packed.floor_shift[clips])
     assert set(real) == {metric.key for metric in SHOWN["first"]} | {"foot_alternation_hz", "bone_swing_deg"}
     for key, values in real.items():
         np.testing.assert_allclose(again[key], values, atol=1e-6, err_msg=key)

@@ -167,36 +167,6 @@ def motion_figures(motion: Motion, path: RootPath, window: int, floor: float) ->
     )
 
 
-def measure_clips(packed: PackedMotion, clips: Sequence[int], *, window: int) -> pd.DataFrame:
-    """Measure real clips as if each were a rollout that follows its own smoothed path.
-
-    Args:
-      packed: the data set.
-      clips: clip numbers, at least one.
-      window: where the seams of a rollout would lie, frames.
-
-    Returns:
-      A row a clip, with the columns of `motion_figures`.
-    """
-    motions = [(packed.motion(clip), float(packed.floor_shift[clip])) for clip in clips]
-    return pd.DataFrame([motion_figures(motion, own_path(motion), window, floor) for motion, floor in motions])
-
-
-def measure_rollout(rollout: Rollout, floor_shift) -> pd.DataFrame:
-    """Measure every character of a rollout against the path it was given.
-
-    Args:
-      rollout: what was generated.
-      floor_shift: height of a resting toe of each character's style, [B], metres.
-
-    Returns:
-      A row a character, with the columns of `motion_figures`.
-    """
-    floors = np.broadcast_to(np.asarray(floor_shift, np.float64), (len(rollout.styles),))
-    walks = [(rollout.motion(place), path, float(floors[place])) for place, path in enumerate(rollout.paths)]
-    return pd.DataFrame([motion_figures(motion, path, rollout.window, floor) for motion, path, floor in walks])
-
-
 def by_round(rollout: Rollout) -> pd.DataFrame:
     """Follow a rollout round by round: does it lose the path, does it fall apart?
 

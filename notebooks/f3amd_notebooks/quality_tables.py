@@ -151,8 +151,8 @@ def quality_table(real: pd.DataFrame, measured: Mapping[tuple[str, int], pd.Data
     """Collect the figures of several systems, real motion first.
 
     Args:
-      real: from `real_clips.measure_clips`.
-      measured: (model, steps) -> what `real_clips.measure_rollout` returned.
+      real: from `walk_tables.measure_clips`.
+      measured: (model, steps) -> what `walk_tables.measure_rollout` returned.
 
     Returns:
       Tidy rows: label, model, steps (0 for real motion), metric, unit, better, value (mean over

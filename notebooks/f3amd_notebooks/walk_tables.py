@@ -4,8 +4,9 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 import pandas as pd
+from f3amd_lib.data.packed import PackedMotion
 from f3amd_lib.ground.names import row_label
-from f3amd_lib.measures.real_clips import STANDING, measure_rollout, sideways_share
+from f3amd_lib.measures.real_clips import STANDING, motion_figures, own_path, sideways_share
 from f3amd_lib.measures.registry import METRICS
 from f3amd_lib.measures.walking import CHECKS, walking_figures
 from f3amd_lib.motion.root_paths import RootPath
@@ -16,6 +17,36 @@ from f3amd_lib.rollout.generated import Rollout
 FACTORS = {"joint_acceleration": 1.5, "foot_alternation": 1.5, "bone_swing": 1.5, "contact_share": 2.0}
 """Metric -> the factor within which a generated walker must come to the real one, above and below,
 to count as a walking person (our choice)."""
+
+
+def measure_clips(packed: PackedMotion, clips: Sequence[int], *, window: int) -> pd.DataFrame:
+    """Measure real clips as if each were a rollout that follows its own smoothed path.
+
+    Args:
+      packed: the data set.
+      clips: clip numbers, at least one.
+      window: where the seams of a rollout would lie, frames.
+
+    Returns:
+      A row a clip, with the columns of `motion_figures`.
+    """
+    motions = [(packed.motion(clip), float(packed.floor_shift[clip])) for clip in clips]
+    return pd.DataFrame([motion_figures(motion, own_path(motion), window, floor) for motion, floor in motions])
+
+
+def measure_rollout(rollout: Rollout, floor_shift) -> pd.DataFrame:
+    """Measure every character of a rollout against the path it was given.
+
+    Args:
+      rollout: what was generated.
+      floor_shift: height of a resting toe of each character's style, [B], metres.
+
+    Returns:
+      A row a character, with the columns of `motion_figures`.
+    """
+    floors = np.broadcast_to(np.asarray(floor_shift, np.float64), (len(rollout.styles),))
+    walks = [(rollout.motion(place), path, float(floors[place])) for place, path in enumerate(rollout.paths)]
+    return pd.DataFrame([motion_figures(motion, path, rollout.window, floor) for motion, path, floor in walks])
 
 
 def walking_checks(real: Mapping, measured: Mapping[tuple[str, int], Mapping]) -> pd.DataFrame:

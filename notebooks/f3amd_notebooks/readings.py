@@ -9,7 +9,6 @@ import pkgutil
 from collections.abc import Mapping
 
 import pandas as pd
-
 from f3amd_lib.ground.names import check_known
 from f3amd_lib.ground.papers import check_entry, find_entry, load_paper_file
 from f3amd_lib.networks.presets import PRESETS
