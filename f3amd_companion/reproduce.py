@@ -8,8 +8,6 @@ replaces the last one's. Results of `laptop` and `gpu` go to `paper_figures/`, t
 `runs/`; `F3AMD_RESULTS_DIR` overrules both.
 """
 
-from __future__ import annotations
-
 import ast
 import collections
 import contextlib

@@ -58,7 +58,7 @@ _KINDS = {
     name: function
     for module in (judging, theory)
     for name, function in inspect.getmembers(module, inspect.isfunction)
-    if function.__annotations__.get("return") == "Finding" and name[0] != "_"
+    if function.__annotations__.get("return") == judging.Finding and name[0] != "_"
 }
 """Kind of judgement, as `claims.toml` names it -> function of the evidence and the statement's parameters."""
 

@@ -43,13 +43,6 @@ def known(look: Callable, *arguments, **named):
         return None
 
 
-def _table_or_gap(load: Callable, name: str):
-    try:
-        return load(name)
-    except NotMeasured as gap:
-        return gap
-
-
 # ---------------------------------------------------------------------------- figures and intervals
 
 
@@ -170,14 +163,9 @@ class Evidence:
         self.at = functools.cache(at)
         self.framework, self.printed = framework, framework != "jax"
         # A ledger asks for thousands of figures, of few tables and by few values of a column.
-        self._read = functools.cache(functools.partial(_table_or_gap, load))
+        self._load = functools.cache(load)
         self._holding = functools.cache(lambda name, column, value: (self._load(name)[0][column] == value).to_numpy())
         self.forget()
-
-    def _load(self, name: str):
-        if isinstance(read := self._read(name), NotMeasured):
-            raise read.with_traceback(None)
-        return read
 
     def forget(self) -> None:
         """Forget what was looked up; whoever wants to know what a rule looks up calls this first."""

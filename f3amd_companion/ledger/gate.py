@@ -6,8 +6,6 @@ verdict; and, where nothing stands beside a figure, where twice the length chang
 All of this is ours.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterator, Mapping
 
 import numpy as np

@@ -19,8 +19,6 @@ Those of the first ledger have not changed since; it was written when a first qu
 was known, and nothing else.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import combinations, pairwise, product
 

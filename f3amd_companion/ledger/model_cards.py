@@ -5,8 +5,6 @@
 Everything on a card is read from the weights file and from committed results; nothing is typed in.
 """
 
-from __future__ import annotations
-
 import hashlib
 import logging
 import re

@@ -1,7 +1,5 @@
 """Judgements on theory that the library reaches by computing, without any record (claims T1 to T3)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import pairwise
 

@@ -6,8 +6,6 @@ from a step of the teacher's further on; from the last level of a phase that ste
 are apart, the teacher's own training loss says, with the answer in the data's place.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -11,8 +11,6 @@ The lines are what survives a change of data: ratios to real motion, changes bet
 CAMDM's code. Likeness is no quality: the paper's network may have faults of its own.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import product
 

@@ -12,8 +12,6 @@ and trained if it has no weights. Rows of weights that have changed since are me
 Each returns the path of its table.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import logging

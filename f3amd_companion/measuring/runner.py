@@ -4,8 +4,6 @@ A record is a table with its run record (`ground.records`). It is written after 
 run that was stopped goes on where it was.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path

@@ -5,8 +5,6 @@ FID and EMD look at motion through a classifier (`measures.classifier`). Nothing
 people would prefer; it says whether a distance knows the order in which we broke the motion.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Mapping, Sequence
 

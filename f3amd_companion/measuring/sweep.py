@@ -7,8 +7,6 @@ one process would have written, row by row in the order of the plan. All machine
 run one checkout.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import functools

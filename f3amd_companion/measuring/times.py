@@ -5,8 +5,6 @@ one process, all models, steps and implementations of one window length and one 
 the machine's own matrix product, so that every row can say which share of the machine's arithmetic it used.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import logging

@@ -4,8 +4,6 @@ The library computes the same numbers by real matrix products (see `networks.spe
 what that is compared with, in speed and in value.
 """
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 from flax import nnx

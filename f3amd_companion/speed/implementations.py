@@ -5,8 +5,6 @@ noise, encodes the condition and walks all steps. Compilation, kinematics and tr
 condition are outside.
 """
 
-from __future__ import annotations
-
 import tempfile
 import time
 from collections.abc import Callable

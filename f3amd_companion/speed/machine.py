@@ -1,7 +1,5 @@
 """The machine that times are taken on: what it is, and how fast it multiplies matrices at best."""
 
-from __future__ import annotations
-
 import os
 import platform
 import re

@@ -1,7 +1,5 @@
 """Speed tables from records: ours beside the paper's, and our own bars."""
 
-from __future__ import annotations
-
 import operator
 from pathlib import Path
 

@@ -4,8 +4,6 @@ A machine that others use, or that grows warm, is slower for some seconds. Alter
 spell hits all candidates alike, so that ratios keep their meaning where single times do not.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

@@ -8,8 +8,6 @@ at once. On a Xeon it was at least as fast as `nn.TransformerEncoderLayer` on it
 computes. PyTorch is part of the extra "bench"; nothing else in the library needs it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import jax.numpy as jnp

@@ -5,8 +5,6 @@ skeleton whose toes are not known no contacts are shown; one whose hips are not 
 face +Z, and no facing is drawn.
 """
 
-from __future__ import annotations
-
 import itertools
 import textwrap
 from collections.abc import Mapping, Sequence

@@ -4,8 +4,6 @@ Left limbs are light orange, right limbs dark blue, the trunk dark grey (they di
 so they survive grey print); a toe in contact gets green.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

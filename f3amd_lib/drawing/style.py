@@ -3,8 +3,6 @@
 Colours keep apart for colour-blind readers and, by lightness and marker, in grey print too.
 """
 
-from __future__ import annotations
-
 import hashlib
 import io
 import re

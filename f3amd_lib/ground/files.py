@@ -1,7 +1,5 @@
 """Writing files so that each appears whole or not at all, and never over someone's work."""
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import os

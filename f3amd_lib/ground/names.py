@@ -1,7 +1,5 @@
 """Names and settings that people type: refuse an unknown one and say which is nearest; one check of their values."""
 
-from __future__ import annotations
-
 import dataclasses
 import difflib
 import math

@@ -1,7 +1,5 @@
 """What a paper says, as data: a folder of `papers/` for each, with its tables, equations, claims and open points."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Iterable, Mapping
 from pathlib import Path

@@ -5,8 +5,6 @@ data set, seed, code and machine made it, and holds a checksum of the CSV, so th
 or swapped by hand is noticed. What draws figures reads tables only through `read_table`.
 """
 
-from __future__ import annotations
-
 import datetime
 import hashlib
 import importlib.metadata

@@ -1,7 +1,5 @@
 """Committed tables, for notebooks that draw what they do not measure themselves."""
 
-from __future__ import annotations
-
 import pandas as pd
 
 from f3amd_lib.ground.names import counted_cores

@@ -4,8 +4,6 @@ A tidy table has one number a row: columns that say what it is about (model, ste
 `metric`, `unit`, `better` and `value`.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 import re

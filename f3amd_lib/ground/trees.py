@@ -4,8 +4,6 @@ Writing goes to a temporary file that then takes the name, so that a crash leave
 Reading checks names, shapes, types and a checksum.
 """
 
-from __future__ import annotations
-
 import ast
 import contextlib
 import hashlib

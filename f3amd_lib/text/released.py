@@ -4,8 +4,6 @@ A release is a PyTorch checkpoint, so a pickle, which may run code and is opened
 shows how PyTorch itself, told to read weights only, writes the arrays into a safetensors file; this module reads that.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import math

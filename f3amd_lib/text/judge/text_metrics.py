@@ -6,8 +6,6 @@ that figures of different ones are never compared; orderings are. FID is `distri
 Source: Guo et al. 2022 (HumanML3D) and its released code; ACMDM, section 4.1 and its released code.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.sparse import coo_array
 

@@ -6,8 +6,6 @@
 Each stage leaves one file that is whole in itself, with the weights of the stages before it. `STAGES` has them all.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 from f3amd_lib.ground.names import refuse_unknown
