@@ -16,7 +16,6 @@ import functools
 import html
 import inspect
 import json
-import logging
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -36,14 +35,13 @@ from f3amd_companion.ledger.evidence import (
     snapshot_evidence,
 )
 from f3amd_companion.ledger.gate import why_not_judged
+from f3amd_lib.ground import log
 from f3amd_lib.ground.files import read_toml, write_whole
 from f3amd_lib.ground.papers import check_entry, find_entry, has_paper_file, load_paper_file, paper_folders
 from f3amd_lib.ground.profiles import load_profile, repository_root
 from f3amd_lib.ground.tables import compact_table, markdown_table
 from f3amd_lib.measures.registry import METRICS
 from f3amd_lib.papers.printed import SCHEMAS, TIMES, check_model
-
-log = logging.getLogger("f3amd")
 
 DATASET_ORDER = ("bandai", "synthetic", "folder")
 """Whose records decide: Bandai's motion first; CAMDM's published weights walk on a folder alone. All

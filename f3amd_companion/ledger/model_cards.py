@@ -6,7 +6,6 @@ Everything on a card is read from the weights file and from committed results; n
 """
 
 import hashlib
-import logging
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,6 +13,7 @@ from pathlib import Path
 import jax
 import pandas as pd
 
+from f3amd_lib.ground import log
 from f3amd_lib.ground.files import read_toml, write_whole
 from f3amd_lib.ground.names import counted_cores
 from f3amd_lib.ground.papers import load_paper_file
@@ -30,8 +30,6 @@ from f3amd_lib.text.judge.text_judge import load_judge
 from f3amd_lib.text.stages.text_models import JUDGE, CaptionedModel, is_latent_preset, load_text_model
 from f3amd_lib.training.checkpoints import load_model
 from f3amd_lib.training.pipeline import PRETRAINED_DIR
-
-log = logging.getLogger("f3amd")
 
 _CARDS = read_toml(Path(__file__).with_name("cards.toml"))
 _OF_HANDS = ["motions", "asked_hand", "other_hand", "both_hands", "no_hand"]

@@ -21,7 +21,6 @@ history, path and style allow, and never look at its noisy input; one step then 
 from __future__ import annotations
 
 import itertools
-import logging
 import time
 from collections import ChainMap
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -42,6 +41,7 @@ from f3amd_companion.measuring.times import compiled_steps, training_call
 from f3amd_companion.speed.machine import device_name, matmul_precision, prepared_at_once
 from f3amd_companion.speed.timing import take_turns
 from f3amd_lib.data.windows import WindowSet
+from f3amd_lib.ground import log
 from f3amd_lib.ground.files import read_toml
 from f3amd_lib.ground.names import check_known
 from f3amd_lib.ground.papers import check_entry, load_paper_file
@@ -61,8 +61,6 @@ from f3amd_lib.training.denoising_task import DenoisingTask
 from f3amd_lib.training.optimise import held_out_terms, restore_state
 from f3amd_lib.training.pipeline import ModelFiles, PreparedData, as_trained, set_aside_run, train_in_legs
 from f3amd_lib.training.recipe import TrainingConfig, paper_recipe
-
-log = logging.getLogger("f3amd")
 
 EPOCHS = 100
 """Of the whole run that the recipe is made for (section 4.5); snapshots come long before."""

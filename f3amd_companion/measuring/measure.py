@@ -14,7 +14,6 @@ Each returns the path of its table.
 
 import dataclasses
 import itertools
-import logging
 import time
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -28,6 +27,7 @@ from f3amd_companion.measuring.runner import Records, records_folder
 from f3amd_companion.measuring.times import Candidate, time_group
 from f3amd_companion.serving.foot_locking import lock_rollout
 from f3amd_lib.data.packed import PackedMotion
+from f3amd_lib.ground import log
 from f3amd_lib.ground.names import asked_network
 from f3amd_lib.ground.profiles import Profile, runs_dir
 from f3amd_lib.ground.records import run_record, write_table
@@ -54,8 +54,6 @@ from f3amd_lib.text.released import read_released
 from f3amd_lib.training.checkpoints import TrainedModel
 from f3amd_lib.training.pipeline import PreparedData, available_models, obtain_model
 from f3amd_lib.training.recipe import profile_recipe
-
-log = logging.getLogger("f3amd")
 
 STEPS = (8, 4, 2, 1)
 """Numbers of denoising steps that the paper compares (Table 5)."""

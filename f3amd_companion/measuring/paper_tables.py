@@ -6,7 +6,6 @@ comes first: where its figures are not the paper's, data or evaluator are not, a
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,6 +16,7 @@ from safetensors import safe_open
 
 from f3amd_companion.measuring.runner import Records
 from f3amd_companion.measuring.text_tables import BRANCHES, REAL, Bench, measure_rows
+from f3amd_lib.ground import log
 from f3amd_lib.ground.names import check_known
 from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.ground.records import run_record, write_table
@@ -32,8 +32,6 @@ from f3amd_lib.text.judge import text_metrics
 from f3amd_lib.text.judge.text_judge import TextJudge, text_figures
 from f3amd_lib.text.released import FAMILIES, read_released, released_encoder
 from f3amd_lib.text.stages.text_models import CONTROL, load_text_model
-
-log = logging.getLogger("f3amd")
 
 EVALUATORS = {"acmdm": "acmdm-evaluator", "motionpcm": "evaluator"}
 """Paper -> family of the evaluator that its figures are of, and name of its file."""

@@ -4,16 +4,14 @@ A record is a table with its run record (`ground.records`). It is written after 
 run that was stopped goes on where it was.
 """
 
-import logging
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import pandas as pd
 
+from f3amd_lib.ground import log
 from f3amd_lib.ground.profiles import Profile, results_dir
 from f3amd_lib.ground.records import kept_rows, others_rows, write_table
-
-log = logging.getLogger("f3amd")
 
 
 def records_folder(profile: Profile) -> Path:

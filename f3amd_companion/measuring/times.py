@@ -7,7 +7,6 @@ the machine's own matrix product, so that every row can say which share of the m
 
 import dataclasses
 import itertools
-import logging
 import time
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
@@ -26,6 +25,7 @@ from f3amd_companion.speed.implementations import Workload, jit_round
 from f3amd_companion.speed.machine import describe_machine, device_name, matmul_precision, prepared_at_once
 from f3amd_companion.speed.speed_tables import fastest_implementations
 from f3amd_companion.speed.timing import take_turns
+from f3amd_lib.ground import log
 from f3amd_lib.ground.files import read_toml
 from f3amd_lib.ground.names import check_known, row_label
 from f3amd_lib.ground.profiles import Profile
@@ -38,8 +38,6 @@ from f3amd_lib.training.denoising_task import DenoisingTask
 from f3amd_lib.training.optimise import compile_steps, initial_state, planned_memory
 from f3amd_lib.training.pipeline import PreparedData
 from f3amd_lib.training.recipe import short_recipe
-
-log = logging.getLogger("f3amd")
 
 SUITES: dict[str, list[dict]] = read_toml(Path(__file__).with_name("suites.toml"))
 """What each suite times."""

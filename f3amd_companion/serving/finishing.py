@@ -1,7 +1,6 @@
 """Motion as people look at it: seams blended, feet held; crowds of it as files and pictures."""
 
 import contextlib
-import logging
 import re
 from pathlib import Path
 
@@ -12,10 +11,9 @@ from f3amd_companion.serving.foot_locking import lock_feet
 from f3amd_companion.serving.player import Character, Scene, write_player
 from f3amd_lib.data.features import motion_from_frames, world_frames
 from f3amd_lib.drawing import pictures, style
+from f3amd_lib.ground import log
 from f3amd_lib.ground.files import whole_folder
 from f3amd_lib.rollout.blending import blend_seams
-
-log = logging.getLogger("f3amd")
 
 
 def held(lock, made):

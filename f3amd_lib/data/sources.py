@@ -18,7 +18,6 @@ import functools
 import hashlib
 import io
 import json
-import logging
 import os
 import re
 import unicodedata
@@ -35,6 +34,7 @@ import pandas as pd
 import pooch
 from tqdm import tqdm
 
+from f3amd_lib.ground import log
 from f3amd_lib.ground.files import read_toml
 from f3amd_lib.ground.left_out import leave_out
 from f3amd_lib.ground.names import check_known
@@ -44,8 +44,6 @@ from f3amd_lib.motion.bvh import format_bvh, parse_bvh
 from f3amd_lib.motion.plausible import as_person
 from f3amd_lib.motion.retarget import retarget as put_on
 from f3amd_lib.motion.skeleton import Motion, resample
-
-log = logging.getLogger("f3amd")
 
 _SETS = read_toml(Path(__file__).with_name("data_sets.toml"))
 NAMES = tuple(_SETS)

@@ -1,9 +1,8 @@
 """One bad record among many: it is left out, counted and named; where many are bad, the whole is refused."""
 
-import logging
 from collections.abc import Sequence
 
-log = logging.getLogger("f3amd")
+from f3amd_lib.ground import log
 
 MOST_BROKEN = 0.2
 """Share of a data set's records that may be broken."""

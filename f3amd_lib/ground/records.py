@@ -10,7 +10,6 @@ import hashlib
 import importlib.metadata
 import io
 import json
-import logging
 import os
 import platform
 import re
@@ -22,10 +21,9 @@ import numpy as np
 import pandas as pd
 
 import f3amd_lib
+from f3amd_lib.ground import log
 from f3amd_lib.ground.files import named_file, read_toml, set_aside, write_whole
 from f3amd_lib.ground.names import asked_network
-
-log = logging.getLogger("f3amd")
 
 _CHECKOUT = str(Path(__file__).resolve().parents[2])
 _CODE = ("f3amd_lib", "f3amd_companion", "notebooks")

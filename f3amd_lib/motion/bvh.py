@@ -8,7 +8,6 @@ metres and rotation matrices.
 
 import contextlib
 import io
-import logging
 import re
 import warnings
 from dataclasses import dataclass
@@ -16,11 +15,10 @@ from pathlib import Path
 
 import numpy as np
 
+from f3amd_lib.ground import log
 from f3amd_lib.ground.files import write_whole
 from f3amd_lib.motion.rotations import euler_from_matrix, matrix_from_euler
 from f3amd_lib.motion.skeleton import Motion, Skeleton
-
-log = logging.getLogger("f3amd")
 
 RIGID_TOLERANCE, TOLD_TOLERANCE = 5e-3, 1e-3
 """Metres by which a joint's position channels may wander before its bone is not rigid, and before that is told."""

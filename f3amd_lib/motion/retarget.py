@@ -10,17 +10,14 @@ the reference has it.
 Source: ours.
 """
 
-import logging
-
 import numpy as np
 from scipy.interpolate import make_interp_spline
 
+from f3amd_lib.ground import log
 from f3amd_lib.motion.anatomy import leg_length
 from f3amd_lib.motion.curves import unit
 from f3amd_lib.motion.inverse_kinematics import aimed
 from f3amd_lib.motion.skeleton import Motion, Skeleton, global_rotations, local_rotations
-
-log = logging.getLogger("f3amd")
 
 _SIDES = ("hip", "knee", "ankle", "toe", "shoulder", "elbow", "wrist")
 NEEDED = ("neck", "head", *(f"{side}_{part}" for side in ("left", "right") for part in _SIDES))

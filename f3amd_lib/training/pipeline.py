@@ -8,7 +8,6 @@ project lies in `f3amd_lib/pretrained/<data set>/` in the same form.
 """
 
 import functools
-import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +22,7 @@ from f3amd_lib.data.features import Normaliser, num_channels
 from f3amd_lib.data.packed import PackedMotion, packed_dataset
 from f3amd_lib.data.sources import SPLITS, open_dataset
 from f3amd_lib.data.windows import WindowSet, build_windows, fit_normaliser, starting_poses
+from f3amd_lib.ground import log
 from f3amd_lib.ground.files import locked, set_aside
 from f3amd_lib.ground.profiles import PRETRAINED_DIR, Profile, runs_dir
 from f3amd_lib.ground.records import read_table, run_record, whole_table, write_table
@@ -32,8 +32,6 @@ from f3amd_lib.training.checkpoints import TrainedModel, load_model, save_model
 from f3amd_lib.training.denoising_task import DenoisingTask, denoising_task, weights_identity
 from f3amd_lib.training.optimise import Task, TrainingState, differences, optimise, restore_state
 from f3amd_lib.training.recipe import TrainingConfig, profile_recipe
-
-log = logging.getLogger("f3amd")
 
 
 @dataclass(frozen=True, eq=False)

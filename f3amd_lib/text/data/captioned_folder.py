@@ -4,7 +4,6 @@
 """
 
 import json
-import logging
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -14,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from f3amd_lib.data.sources import SPLITS, Dataset, assign_splits, read_clips
+from f3amd_lib.ground import log
 from f3amd_lib.ground.files import whole_folder
 from f3amd_lib.ground.left_out import leave_out
 from f3amd_lib.ground.names import nearest_hint
@@ -30,8 +30,6 @@ from f3amd_lib.text.data.text_motions import (
     TextMotions,
     text_motions,
 )
-
-log = logging.getLogger("f3amd")
 
 
 def write_caption_line(caption: str) -> str:

@@ -17,13 +17,13 @@ Source: the released data set of Guo et al. 2022 and its README.
 
 import contextlib
 import json
-import logging
 import math
 from pathlib import Path
 
 import numpy as np
 
 from f3amd_lib.data.sources import SPLITS, assign_splits
+from f3amd_lib.ground import log
 from f3amd_lib.ground.files import read_toml
 from f3amd_lib.ground.left_out import leave_out
 from f3amd_lib.ground.tables import read_text
@@ -31,8 +31,6 @@ from f3amd_lib.motion.skeleton import Skeleton
 from f3amd_lib.text.data.redundant import CONTACT_STEP, positions_from_redundant
 from f3amd_lib.text.data.text_encoders import plain_caption
 from f3amd_lib.text.data.text_motions import HELD_OUT_PERCENT, MOST_FRAMES, TextMotions
-
-log = logging.getLogger("f3amd")
 
 LAYOUTS = read_toml(Path(__file__).with_name("layouts.toml"))
 """Published layouts: "humanml3d" and "kit"."""
