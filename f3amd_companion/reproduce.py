@@ -9,7 +9,6 @@ replaces the last one's. Results of `laptop` and `gpu` go to `paper_figures/`, t
 """
 
 import ast
-import collections
 import contextlib
 import os
 import time
@@ -81,13 +80,6 @@ def check_parameters(notebooks: Iterable[Path], names: Collection[str]) -> None:
                 raise ValueError(f"{path.name} has no parameter {name!r}{nearest_hint(name, known)}")
 
 
-def _wrote(folder: Path, start: float) -> str:
-    """Say how many files of each kind were written since a moment; records beside tables do not count."""
-    files = (path for path in folder.rglob("*") if path.suffix not in (".json", ".md") and path.is_file())
-    kinds = collections.Counter(path.relative_to(folder).parts[0] for path in files if path.stat().st_mtime >= start)
-    return "   wrote " + (", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items())) or "no file")
-
-
 def keep_once(folders: Iterable[Path]) -> None:
     """Delete pictures that have the name and the bytes of one before.
 
@@ -147,7 +139,7 @@ def reproduce(
     check_parameters(selected, parameters)
 
     own_folder, results = runs_dir(dataset, profile), results_dir(dataset, profile)
-    rows, failure = _run_each(selected, own_folder / "notebooks", parameters, say, lambda began: _wrote(results, began))
+    rows, failure = _run_each(selected, own_folder / "notebooks", parameters, say)
     summary = pd.DataFrame(rows)
     # Only now: the record asks JAX for its devices, and a process that holds a GPU would have kept
     # its memory from the notebooks.
@@ -185,7 +177,7 @@ def run_course(only: Iterable[str] = (), *, say: Callable[[str], None] = lambda 
     return [root / "runs/course" / row["notebook"] for row in rows]
 
 
-def _run_each(notebooks: list[Path], folder: Path, parameters: Mapping, say, wrote=lambda began: ""):
+def _run_each(notebooks: list[Path], folder: Path, parameters: Mapping, say):
     """Run notebooks into copies until one fails; return a row of the summary each, and the failure or None."""
     folder.mkdir(parents=True, exist_ok=True)
     rows, failure = [], None
@@ -202,7 +194,7 @@ def _run_each(notebooks: list[Path], folder: Path, parameters: Mapping, say, wro
             if failure:
                 break
             took = f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.1f} min"
-            say(f"{path.stem:24s} {took:>11s}{wrote(began)}")
+            say(f"{path.stem:24s} {took:>11s}")
     return rows, failure
 
 

@@ -164,7 +164,7 @@ def load_shapes(folder: Path) -> dict:
 
 
 def test_a_program_does_not_say_which_files_made_it(exported):
-    for program in (exported.stablehlo, exported.exported.serialize()):
+    for program in (exported.exported.mlir_module_serialized, exported.exported.serialize()):
         assert b".py" not in program
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from builders import CHANNELS, WINDOW, network_of, refused, tiny_camdm, tiny_config
 
-from f3amd_companion.measuring.times import PARTS, SUITES, Candidate, check_suites, plan, time_group
+from f3amd_companion.measuring.times import PARTS, SUITES, Candidate, plan, time_group
 from f3amd_companion.speed import implementations
 from f3amd_companion.speed.implementations import NotPossible, Workload, prepare_round, random_condition
 from f3amd_lib.diffusion.samplers import num_evaluations
@@ -99,7 +99,7 @@ def test_plans_name_presets_and_implementations_that_exist_each_once():
         for candidate in members:
             assert presets.find_preset(candidate.model).name == candidate.model
             assert candidate.way in implementations.IMPLEMENTATIONS
-    refused("unknown suite", check_suites, ["bar"])
+    refused("unknown suite", plan, "bar")
 
 
 def test_parts_are_left_out():

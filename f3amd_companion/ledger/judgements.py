@@ -346,13 +346,12 @@ def speedup_growth(evidence: Evidence, slow, fast, device, characters) -> Findin
 
 def step_exponent(evidence: Evidence, model, device, characters, bounds=None) -> Finding:
     """Judge the exponent p of time ~ steps^p, or of two numbers of characters whether it is larger with the second."""
-    steps, found = (8, 4, 2, 1), []
-    for count in characters:
-        found.append(power_law(steps, [_time(evidence, model | {"steps": each}, device, count) for each in steps]))
+    steps = (8, 4, 2, 1)
+    times = lambda count: [_time(evidence, model | {"steps": each}, device, count) for each in steps]
+    found = [power_law(steps, times(count)) for count in characters]
     text = ", ".join(f"{figure_text(one)} at {count:,}" for one, count in zip(found, characters, strict=True))
-    return _compared(
-        found[0] if bounds else ratio(found[1].map(np.exp), found[0].map(np.exp)), bounds
-    ), f"exponent {text}"
+    judged = found[0] if bounds else ratio(found[1].map(np.exp), found[0].map(np.exp))
+    return _compared(judged, bounds), f"exponent {text}"
 
 
 def _converged_epoch(curve: pd.Series, model: str, metric: str) -> float:

@@ -43,7 +43,7 @@ from f3amd_companion.speed.timing import take_turns
 from f3amd_lib.data.windows import WindowSet
 from f3amd_lib.ground import log
 from f3amd_lib.ground.files import read_toml
-from f3amd_lib.ground.names import check_known
+from f3amd_lib.ground.names import check_known, checked_value
 from f3amd_lib.ground.papers import check_entry, load_paper_file
 from f3amd_lib.ground.profiles import Profile
 from f3amd_lib.ground.records import read_table, run_record, write_table
@@ -209,18 +209,16 @@ def queue(path: Path = QUEUES["campaign"], package: str | None = None) -> list[t
         for number, row in enumerate(table["run"], 1):
             where = f"{path}: run {number}"
             check_entry(row, where, ["windows"], ["presets", "recipes", "seeds", "window", "length"])
-            row = {"seeds": [0], "window": 32, **row}
-            numbers = ("windows", row["windows"], 1), ("seeds", row["seeds"], 0), ("window", [row["window"]], 2)
-            numbers += (("length", [row["length"]], 1),) if "length" in row else ()
-            for key, values, least in numbers:
-                if not (isinstance(values, list) and all(type(one) is int and least <= one < 2**31 for one in values)):
-                    raise ValueError(f"{where}: {key} takes whole numbers of {least} or more, got {row[key]!r}"[:300])
+            row = {"seeds": [0], "window": 32, "length": None, **row}
+            lists, single = "tuple[int, ...]", "int | None"
+            for key, kind in {"windows": lists, "seeds": lists, "window": single, "length": single}.items():
+                checked_value(f"{key} of run {number}", row[key], kind, "0 or more" if key == "seeds" else "above 0")
             if not (row.get("presets") or row.get("recipes")):
                 raise ValueError(f"{where}: names neither presets nor recipes")
             named = [presets.find_preset(name).name for name in row.get("presets", ())]
             for recipe in row.get("recipes") or ["paper"]:
                 for preset, seed in itertools.product(named or [find_recipe(recipe).preset], row["seeds"]):
-                    run = Run(preset, recipe, row["window"], seed, row.get("length"))
+                    run = Run(preset, recipe, row["window"], seed, row["length"])
                     run.config(1000, 8)  # refuses a change that is none of this model's
                     snapshots += [(run, 1000 * thousands) for thousands in row["windows"]]
     return snapshots

@@ -25,6 +25,7 @@ import numpy as np
 import pandas as pd
 
 from f3amd_companion.measuring.runner import Records, records_folder
+from f3amd_companion.speed.timing import take_turns
 from f3amd_lib.ground.arrays import in_batches
 from f3amd_lib.ground.names import check_known
 from f3amd_lib.ground.papers import load_paper_file
@@ -374,12 +375,9 @@ def control_rows(bench: Bench, trained: TextModel, row: Mapping, about: Mapping,
 
 def median_seconds(ask: Callable, count: int) -> float:
     """Return the median seconds of so many calls `ask(number)`, after one that compiles."""
-    times = []
-    for number in range(count + 1):
-        started = time.perf_counter()
-        jax.block_until_ready(ask(number))
-        times.append(time.perf_counter() - started)
-    return float(np.median(times[1:]))
+    numbers = itertools.count()
+    call = lambda: jax.block_until_ready(ask(next(numbers)))
+    return take_turns({"": call}, min_rounds=count, min_seconds=np.inf, warmup=1)[""].median
 
 
 # ------------------------------------------------------------------------------------------------------------ MotionPCM

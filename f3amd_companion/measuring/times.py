@@ -94,15 +94,9 @@ class Candidate:
         return self.window_frames, self.characters, self.precision
 
 
-def check_suites(names: Iterable[str]) -> list[str]:
-    """Return the names as a list; ValueError for an unknown one."""
-    for name in (names := list(names)):
-        check_known(name, SUITES, "suite")
-    return names
-
-
 def plan(suite: str) -> dict[tuple, list[Candidate]]:
-    """Return what a suite of `SUITES` times, by group, each candidate once."""
+    """Return what a suite of `SUITES` times, by group, each candidate once; ValueError for an unknown one."""
+    check_known(suite, SUITES, "suite")
     groups: dict[tuple, dict[Candidate, None]] = {}
     for block in SUITES[suite]:
         unusual = {key: block[key] for key in ("window_frames", "precision") if key in block}
@@ -185,7 +179,7 @@ def measure_synthesis_time(
     Raises:
       ValueError: for an unknown suite.
     """
-    suites = check_suites(suites or DEFAULT_SUITES[profile.name])
+    suites = suites or DEFAULT_SUITES[profile.name]
     turns = {"fewest_rounds": 3, **_TURNS.get(profile.name, {})}
     record = _record(prepared, profile, "synthesis_time", turns=turns)
     keys = ["suite", *(field.name for field in dataclasses.fields(Candidate))]

@@ -63,11 +63,6 @@ class ExportedRound(NamedTuple):
     manifest: dict
     exported: export.Exported
 
-    @property
-    def stablehlo(self) -> bytes:
-        """The program as a portable StableHLO artefact (MLIR bytecode)."""
-        return self.exported.mlir_module_serialized
-
 
 def export_round(network, sigmas, batch: int, sampler: str = "ddim") -> ExportedRound:
     """Export a whole round of synthesis with the weights inside.
@@ -142,7 +137,7 @@ def compile_iree(program: bytes, target: str = "llvm-cpu") -> tuple[bytes, list[
     """Compile a program with IREE.
 
     Args:
-      program: a portable StableHLO artefact, such as `ExportedRound.stablehlo`.
+      program: a portable StableHLO artefact, such as `ExportedRound.exported.mlir_module_serialized`.
       target: a name of `TARGETS`, or "cuda-sm_NN" for a generation of NVIDIA GPUs, which this
         release of IREE may or may not know. None needs the device to be there, except that
         "llvm-cpu" compiles for the CPU that it runs on.
@@ -205,11 +200,12 @@ def save_artefact(
         earlier = artefact.read_manifest(folder)["files"]
         if not overwrite:
             raise ValueError(f"{folder}: exists already; choose another name or pass overwrite=True")
-    files = {artefact.STABLEHLO: exported.stablehlo, artefact.JAX_EXPORT: bytes(exported.exported.serialize())}
+    program = exported.exported.mlir_module_serialized
+    files = {artefact.STABLEHLO: program, artefact.JAX_EXPORT: bytes(exported.exported.serialize())}
     found, compiled = {target: _find_target(target) for target in targets}, {}
     for target, settings in found.items():
         file, started = f"round.{target}.vmfb", time.perf_counter()
-        files[file], flags = compile_iree(exported.stablehlo, target)
+        files[file], flags = compile_iree(program, target)
         host = {"machine": platform.machine(), "features": list(artefact.cpu_features())}
         compiled[target] = {
             "file": file,
