@@ -46,7 +46,6 @@ from f3amd_notebooks.readings import readings_table
 from f3amd_companion.ledger.claims import judge_claims, ledger, ledger_markdown
 from f3amd_companion.ledger.model_cards import card_of, committed_quality, measured_table
 from f3amd_companion.measuring.consistency_task import distil
-from f3amd_companion.measuring.text_tables import PAPERS
 from f3amd_companion.serving.artefact import JAX_EXPORT, MANIFEST, STABLEHLO, load_artefact
 from f3amd_companion.serving.crowd import generate_crowd
 from f3amd_companion.serving.export import export_model
@@ -59,7 +58,7 @@ from f3amd_companion.speed.speed_tables import fastest_implementations, speed_ba
 from f3amd_lib.data.packed import CACHE_DIR_VARIABLE, pack
 from f3amd_lib.data.sources import open_dataset
 from f3amd_lib.diffusion.schedules import straight, variance_preserving_betas
-from f3amd_lib.ground.papers import paper_folders
+from f3amd_lib.ground.papers import load_paper_file, paper_folders
 from f3amd_lib.ground.profiles import load_profile, repository_root
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.ground.stored import committed_table
@@ -231,7 +230,8 @@ def tables(folder: Path) -> dict:
     windows = int(campaign.loc[campaign["recipe"] == "paper", "windows"].max())
     made["Table 3 of the queue"] = digest(quality_markdown(3, of_queue(campaign, windows), "ours"))
     made["measured"] = digest(measured_table(committed_quality("bandai")))
-    for paper, names in PAPERS.items():
+    for paper in ("acmdm", "motionpcm"):
+        names = load_paper_file("experiments", paper).keys() - {"settings"}
         for name in sorted(set(names) - {"text_guidance"}):  # which no paper prints
             metrics = list(committed_table("bandai", name)[0]["metric"].unique())
             rows, sentence = beside_printed(paper, name, metrics)

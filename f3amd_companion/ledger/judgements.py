@@ -188,10 +188,6 @@ def range_text(figures: Sequence[Figure], unit: str = "") -> str:
     return f"{number_text(min(values))} to {number_text(max(values))}{unit}"
 
 
-def _values_text(figures: Iterable[Figure]) -> str:
-    return ", ".join(number_text(figure.value) for figure in figures)
-
-
 def _list_text(items: Iterable) -> str:
     return ", ".join(f"{item:,}" if isinstance(item, int) else str(item) for item in items)
 
@@ -245,7 +241,8 @@ def _counted(evidence: Evidence, judge: Callable, between: str, table, metric, r
     firsts = [first.map(lambda bound, count=count: count * bound) for count in sorted(counts)]
     verdicts = {judge([one, *others]) for one in firsts}
     by_points = "".join(f" ({number_text(one.value)} if by points)" for one in firsts[1:])
-    text = f"{number_text(first.value)}{by_points}{between}{_values_text(others)}"
+    values = ", ".join(number_text(other.value) for other in others)
+    text = f"{number_text(first.value)}{by_points}{between}{values}"
     return verdicts.pop() if len(verdicts) == 1 else OPEN, text
 
 

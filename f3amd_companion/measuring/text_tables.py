@@ -48,13 +48,11 @@ from f3amd_lib.text.stages.text_models import CONTROL, PELVIS, LatentModel, Text
 from f3amd_lib.text.stages.train_stage import STAGES, stage_of, stands_on, train_stage
 from f3amd_lib.training.checkpoints import network_with
 
-PAPERS = {
-    "acmdm": ("text_table1", "text_tableA1", "text_table3", "text_table4", "text_tableA5"),
-    "motionpcm": ("text_pcm1", "text_pcm2", "text_pcm3", "text_pcm4", "text_guidance"),
-}
-"""Paper -> its tables that `measure_text_table` knows."""
+EXPERIMENTS = load_paper_file("experiments", "acmdm") | load_paper_file("experiments", "motionpcm")
+"""Table -> its rows and what is trained for them; and the settings of each profile and plan."""
 
-TABLES = tuple(name for names in PAPERS.values() for name in names)
+TABLES = tuple(name for name in EXPERIMENTS if name != "settings")
+"""Those that `measure_text_table` knows."""
 
 HELD = ("pelvis", "left_foot", "right_foot")
 """Joints that stay where they are in upper-body editing (ACMDM section 4.4)."""
@@ -499,7 +497,7 @@ def bench_of(
     judge = obtain_judge(data, encoder, profile, folder=folder, **leg)
     if judge is None:
         return None
-    settings = load_paper_file("experiments", "acmdm")["settings"][plan or profile.name]
+    settings = EXPERIMENTS["settings"][plan or profile.name]
     real = judged_clips(data.cut(settings["most_frames"]))
     chosen = np.random.default_rng(profile.seed).permutation(real.num_clips)[: settings["clips"]]
     return Bench(judge, encoder, real.select(np.sort(chosen)), settings, profile.seed)
@@ -525,7 +523,7 @@ def measure_text_table(
     Returns:
       The table, `records/<name>.csv`; None where the time was over first.
     """
-    about = load_paper_file("experiments", next(paper for paper, names in PAPERS.items() if name in names))[name]
+    about = EXPERIMENTS[name]
     asked, bench = list(models or ()), bench_of(data, encoder, profile, folder=folder, plan=plan, **leg)
     if bench is None:
         return None
