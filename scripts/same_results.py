@@ -38,7 +38,7 @@ from safetensors.numpy import load_file
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this tree's library, whatever is installed
 sys.path.insert(1, str(Path(__file__).resolve().parents[1] / "notebooks"))
 
-from f3amd_notebooks.beside_printed import beside_printed, times_beside_paper, training_beside_paper
+from f3amd_notebooks.beside_printed import beside_printed, speedups_by_turns, times_beside_paper, training_beside_paper
 from f3amd_notebooks.equation_map import equation_map
 from f3amd_notebooks.quality_tables import QUALITY_TABLES, of_queue, quality_markdown
 from f3amd_notebooks.readings import readings_table
@@ -54,7 +54,7 @@ from f3amd_companion.serving.motion_files import write_glb, write_motion_csv
 from f3amd_companion.serving.onnx_export import export_onnx, load_text_or_latent, model_card
 from f3amd_companion.serving.player import player_page, rollout_scene
 from f3amd_companion.speed.machine import describe_machine
-from f3amd_companion.speed.speed_tables import fastest_implementations, speed_bars, speedups_by_turns
+from f3amd_companion.speed.speed_tables import fastest_implementations, speed_bars
 from f3amd_lib.data.packed import CACHE_DIR_VARIABLE, pack
 from f3amd_lib.data.sources import open_dataset
 from f3amd_lib.diffusion.schedules import straight, variance_preserving_betas

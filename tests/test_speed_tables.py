@@ -3,9 +3,9 @@
 import numpy as np
 import pandas as pd
 from builders import refused
-from f3amd_notebooks.beside_printed import times_beside_paper, training_beside_paper
+from f3amd_notebooks.beside_printed import speedups, speedups_by_turns, times_beside_paper, training_beside_paper
 
-from f3amd_companion.speed.speed_tables import fastest_implementations, speed_bars, speedups, speedups_by_turns
+from f3amd_companion.speed.speed_tables import fastest_implementations, speed_bars
 from f3amd_lib.ground.papers import load_paper_table
 
 

@@ -13,8 +13,6 @@ from pathlib import Path
 
 import numpy as np
 
-ARROWS = {"down": " ↓", "up": " ↑"}
-
 
 def read_text(path) -> str:
     """Read what somebody wrote: UTF-8, with a byte order mark or without, or UTF-16; letters are composed (NFC).
@@ -156,14 +154,6 @@ def figure_text(value: float, low: float = np.nan, high: float = np.nan, decimal
     if half < 0 or not np.isclose(value - low, half, rtol=1e-3, atol=1e-9):
         raise ValueError(f"{value} is not in the middle of its interval, {low} to {high}")
     return f"{text} ± {half:.{decimals}f}"
-
-
-def metric_heading(metric: str, unit: str = "", better: str = "") -> str:
-    """Return a column heading such as "trajectory error (m) ↓"; other ways than "down" and "up" have no arrow."""
-    heading = str(metric).replace("_", " ")
-    if isinstance(unit, str) and unit:
-        heading += f" ({unit})"
-    return heading + ARROWS.get(better, "")
 
 
 def _cell(value, digits: int) -> str:

@@ -3,13 +3,16 @@
 from collections.abc import Sequence
 
 import pandas as pd
+from f3amd_companion.speed.speed_tables import fastest_implementations
 from f3amd_lib.ground.papers import has_paper_file, load_paper_file, load_paper_table, paper_folders
 from f3amd_lib.ground.profiles import runs_dir
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.ground.stored import committed_table, measured_table
-from f3amd_lib.ground.tables import ARROWS, markdown_table
+from f3amd_lib.ground.tables import markdown_table
 from f3amd_lib.measures.registry import METRICS
 from f3amd_lib.papers.printed import SCHEMAS, printed_tables
+
+from f3amd_notebooks.quality_tables import ARROWS
 
 
 def beside_printed(paper: str, name: str, metrics: Sequence[str]) -> tuple[pd.DataFrame, str]:
@@ -140,3 +143,44 @@ def training_beside_paper(table: pd.DataFrame) -> pd.DataFrame:
         quotient = joined[minutes] / joined["window_frames"].map(camdm)
         joined.insert(joined.columns.get_loc(minutes) + 1, f"{name}_over_camdm", quotient)
     return joined
+
+
+def speedups_by_turns(times: pd.DataFrame) -> pd.DataFrame:
+    """Return the speedups over CAMDM of our own rounds, both from the same turns.
+
+    Args:
+      times: `synthesis_ways`; JAX's rows count.
+
+    Returns:
+      As `speedups`; what two suites have timed counts once, as in `fastest_implementations`.
+    """
+    suites = sorted(set(times["suite"]), key=lambda name: (name == "bars", name != "main"))
+    times = times[times["framework"] == "jax"]
+    tables = [speedups(fastest_implementations(times[times["suite"] == suite])) for suite in suites]
+    keys = ["model", "window_frames", "steps", "device", "characters"]
+    return pd.concat(tables).drop_duplicates(keys).reset_index(drop=True)
+
+
+def speedups(times: pd.DataFrame, *, window: int = 32) -> pd.DataFrame:
+    """Return how many times faster than CAMDM with 8 steps each row is (Figures 3 and 4).
+
+    Args:
+      times: columns model, window_frames, steps, device, characters and value (ms), one framework;
+        a table of the paper, or rows of `synthesis_time`.
+      window: frames; both sides have it.
+
+    Returns:
+      The rows of that window but CAMDM's with 8 steps, with the column speedup; rows without a
+      CAMDM at as many characters are left out.
+
+    Raises:
+      ValueError: if CAMDM is timed twice for one device and number of characters.
+    """
+    of_window = times[times["window_frames"] == window]
+    is_camdm = (of_window["model"] == "CAMDM") & (of_window["steps"] == 8)
+    camdm = of_window[is_camdm].set_index(["device", "characters"])["value"]
+    if not camdm.index.is_unique:
+        raise ValueError("CAMDM is timed twice for one number of characters: keep one framework")
+    others = of_window[~is_camdm]
+    slow = others.join(camdm.rename("slow"), on=["device", "characters"])["slow"]
+    return others.assign(speedup=slow / others["value"]).dropna(subset=["speedup"])

@@ -15,13 +15,15 @@ import numpy as np
 import pandas as pd
 from f3amd_lib.ground.names import row_label
 from f3amd_lib.ground.papers import load_paper_table
-from f3amd_lib.ground.tables import ARROWS, figure_text, markdown_table, metric_heading
+from f3amd_lib.ground.tables import figure_text, markdown_table
 from f3amd_lib.measures.distributions import intervals_over_repeats
 from f3amd_lib.measures.registry import SHOWN
 from f3amd_lib.networks import presets
 
 QUALITY_TABLES = (3, 5, 6, 8, 9, 10, 11, 12)
 """The paper's tables of motion quality, by number."""
+
+ARROWS = {"down": " ↓", "up": " ↑"}
 
 PAPER_SOURCE = "paper, 100STYLE"
 NOT_MEASURED = "not measured"
@@ -192,7 +194,7 @@ def side_by_side(ours: pd.DataFrame, paper: pd.DataFrame | None = None) -> pd.Da
       A DataFrame: metric (with its unit), then the labels; a figure that is not there is NaN.
     """
     named = ours[["metric", "unit", "better"]].itertuples(index=False)
-    headings = {metric: metric_heading(metric, unit, better) for metric, unit, better in named}
+    headings = {metric: _heading(metric, unit, better) for metric, unit, better in named}
     both = pd.concat([ours, paper])  # which leaves out a paper that is None
     table = both.pivot(index="metric", columns="label", values="value")
     table = table.reindex(index=list(headings), columns=both["label"].unique()).rename(headings)
@@ -243,3 +245,11 @@ def quality_bars(quality: pd.DataFrame, classifier_accuracy: float) -> pd.DataFr
         asked = {"bar": bar.bar, "unit": bar.unit, "asked": f"{bar.sign} {bar.limit:g}"}
         rows.append(asked | found | {"met_by": answer if known else "not measured"})
     return pd.DataFrame(rows)
+
+
+def _heading(metric: str, unit, better: str) -> str:
+    """Return a column heading such as "trajectory error (m) ↓"; other ways than "down" and "up" have no arrow."""
+    heading = str(metric).replace("_", " ")
+    if isinstance(unit, str) and unit:
+        heading += f" ({unit})"
+    return heading + ARROWS.get(better, "")
