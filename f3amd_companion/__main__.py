@@ -799,8 +799,7 @@ def figures(data: str = "synthetic", profile: str = "laptop", only: Repeatable =
     notebook_runs.set_folders(profile)
     took = notebook_runs.reproduce(data, profile, only=only, parameters=parameters, say=log.info)["seconds"]
     log.info("%d notebooks in %.1f minutes (data %s, profile %s)", len(took), took.sum() / 60, data, profile)
-    for line in notebook_runs.what_to_open(results_dir(data, profile)):
-        log.info("  %s", line)
+    log.info("results      %s", results_dir(data, profile))
 
 
 def course(only: Repeatable = ()) -> None:

@@ -96,19 +96,6 @@ def keep_once(folders: Iterable[Path]) -> None:
         seen.add(known)
 
 
-def what_to_open(results: Path) -> list[str]:
-    """Return the files of a run that are worth opening first, as lines "what: path"."""
-    worth = {
-        "a walk to look at": results / "media/00_first_walk.gif",
-        "and the longer one of notebook 05": results / "media/05_rollout.gif",
-        "a crowd to turn around, in a browser": results / "media/14_crowd.html",
-        "film strips": results / "figures/05_film_strip.png",
-        "do they walk, in numbers": results / "tables/05_walks.csv",
-        "each claim of the paper with a verdict": profiles.repository_root() / "paper_figures/claims.md",
-    }
-    return [f"{what}: {_short(path)}" for what, path in worth.items() if path.is_file()]
-
-
 def reproduce(
     dataset: str, profile: str, *, only: Iterable[str] = (), parameters: Mapping | None = None,
     say: Callable[[str], None] = lambda line: None,
