@@ -772,7 +772,7 @@ def sweep(
         prepared, _ = motion.open()  # so that workers find the cache, and the classifier below
         if engine.CAMPAIGN in names or not records.THROUGH_CLASSIFIER.isdisjoint(names):  # trained before the legs
             measuring.protocol_of(prepared, profile, "sweep")
-        record = records.run_record(profile=profile, dataset=prepared.packed, seed=profile.seed, measurement="sweep")
+        record = runner.record_of(profile, prepared.packed, "sweep")
         costs, finished = runner.Records(results / "records", record, {"sweep": ["leg"]}), []
         try:
             for number, (leg, told) in enumerate(engine.run_sweep(work, legs, workers=workers, scheduler=scheduler), 1):

@@ -23,7 +23,7 @@ import pandas as pd
 
 from f3amd_companion.measuring import sensitivity
 from f3amd_companion.measuring.consistency_task import STUDENT_SPACING, TEACHER_STEPS, distil
-from f3amd_companion.measuring.runner import Records, records_folder
+from f3amd_companion.measuring.runner import Records, record_of, records_folder
 from f3amd_companion.measuring.times import Candidate, time_group
 from f3amd_companion.serving.foot_locking import lock_rollout
 from f3amd_lib.data.packed import PackedMotion
@@ -91,10 +91,6 @@ def models_with_weights(profile: Profile, option: str = "--model") -> list[str]:
         f"no trained model for {profile.dataset!r} at profile {profile.name!r}: train one (`f3amd train --data "
         f"{profile.dataset} --profile {profile.name}`) or name one with {option}"
     )
-
-
-def _record(prepared: PreparedData, profile: Profile, measurement: str, **settings) -> dict:
-    return run_record(profile=profile, dataset=prepared.packed, seed=profile.seed, measurement=measurement, **settings)
 
 
 def _models(
@@ -249,7 +245,7 @@ def _measure_walks(
     num_frames = max(2, profile.rollout_frames // 4 // profile.window) * profile.window
     floors = {style: 0.0 if made else style_floor(packed, style) for style in styles}
     paths = {seed: evaluation_paths(packed, styles, num_frames, seed=seed) for seed in range(WALKING_SEEDS)}
-    record = _record(prepared, profile, name, num_frames=num_frames, num_seeds=WALKING_SEEDS, styles=styles)
+    record = record_of(profile, prepared.packed, name, num_frames=num_frames, num_seeds=WALKING_SEEDS, styles=styles)
     trained = _models(prepared, profile, models)
 
     def walks(row: Mapping):
@@ -289,7 +285,7 @@ def measure_trained(prepared: PreparedData, profile: Profile, models: Iterable[s
     trained = _models(prepared, profile, models)
     sum_up = lambda row: {"trained": pd.DataFrame([{"metric": "windows", "value": trained[row["model"]].windows_seen}])}
     todo = [{"model": name, "window_frames": profile.window} for name in trained]
-    record = _record(prepared, profile, "trained")
+    record = record_of(profile, prepared.packed, "trained")
     return _measure(profile, record, ["trained"], todo, sum_up, again=models, trained=trained)
 
 
@@ -337,7 +333,7 @@ def measure_foot_spectrum(prepared: PreparedData, profile: Profile, models: Iter
         return {"foot_spectrum": sensitivity.foot_spectrum(walks).query("model == @row['model']")}
 
     settings = {"num_frames": num_frames, "styles": styles, "steps": profile.num_steps}
-    record = _record(prepared, profile, "foot_spectrum", **settings)
+    record = record_of(profile, prepared.packed, "foot_spectrum", **settings)
     todo = _rows_of(profile, [("real", 0), *((name, profile.num_steps) for name in trained)])
     return _measure(profile, record, ["foot_spectrum"], todo, listen, again=models, trained=trained)
 
@@ -366,7 +362,7 @@ def measure_noise_use(prepared: PreparedData, profile: Profile, models: Iterable
         }
 
     # The table that says what was measured is written last.
-    record, tables = _record(prepared, profile, "noise_use"), ["noise_use", "x0_by_sigma", "input_use"]
+    record, tables = record_of(profile, prepared.packed, "noise_use"), ["noise_use", "x0_by_sigma", "input_use"]
     rows = [{"model": name, "noise": model.diffusion.kind} for name, model in trained.items()]
     return _measure(profile, record, tables, rows, ask, again=models, trained=trained)
 
@@ -386,7 +382,8 @@ def measure_gradient_norm(prepared: PreparedData, profile: Profile, models: Iter
         levels = denoising.gradient_norm_by_sigma(task, model.params, held_out, SIGMAS, seed=profile.seed)
         return {"gradient_norm": levels}
 
-    record, todo = _record(prepared, profile, "gradient_norm", sigmas=SIGMAS), [{"model": name} for name in trained]
+    record = record_of(profile, prepared.packed, "gradient_norm", sigmas=SIGMAS)
+    todo = [{"model": name} for name in trained]
     return _measure(profile, record, ["gradient_norm"], todo, slope, again=models, trained=trained)
 
 
@@ -443,7 +440,7 @@ def measure_round_times(prepared: PreparedData, profile: Profile, models: Iterab
     called = {"value": "milliseconds", "median_low": "milliseconds_low", "median_high": "milliseconds_high"}
     keys = ["model", "steps", "characters"]
     table = times[[*keys, *called]].rename(columns=called).assign(weights=times["model"].map(_digests(trained)))
-    record = _record(prepared, profile, "round_times", characters=_TIMED_CHARACTERS)
+    record = record_of(profile, prepared.packed, "round_times", characters=_TIMED_CHARACTERS)
     records = Records(records_folder(profile), record, {"round_times": keys})
     records.put("round_times", {}, table)
     return records.path("round_times")

@@ -11,12 +11,17 @@ import pandas as pd
 
 from f3amd_lib.ground import log
 from f3amd_lib.ground.profiles import Profile, results_dir
-from f3amd_lib.ground.records import kept_rows, others_rows, write_table
+from f3amd_lib.ground.records import kept_rows, others_rows, run_record, write_table
 
 
 def records_folder(profile: Profile) -> Path:
     """Return where the records of a data set and profile lie."""
     return results_dir(profile.dataset, profile.name) / "records"
+
+
+def record_of(profile: Profile, data, measurement: str, **extra) -> dict:
+    """Return the run record of a measurement on a data set with a profile's seed."""
+    return run_record(profile=profile, dataset=data, seed=profile.seed, measurement=measurement, **extra)
 
 
 class Records:

@@ -24,13 +24,13 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
-from f3amd_companion.measuring.runner import Records, records_folder
+from f3amd_companion.measuring.runner import Records, record_of, records_folder
 from f3amd_companion.speed.timing import take_turns
 from f3amd_lib.ground.arrays import in_batches
 from f3amd_lib.ground.names import check_known
 from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.ground.profiles import Profile, runs_dir
-from f3amd_lib.ground.records import read_table, run_record, write_table
+from f3amd_lib.ground.records import read_table, write_table
 from f3amd_lib.ground.trees import weights_digest
 from f3amd_lib.measures.distributions import intervals_over_repeats
 from f3amd_lib.measures.metrics import joint_acceleration
@@ -166,10 +166,8 @@ class Bench:
 
     def record(self, profile: Profile, data: TextMotions, measurement: str, **extra) -> dict:
         """Return the record of a measurement with this judge."""
-        return run_record(
-            profile=profile, dataset=data, seed=profile.seed, measurement=measurement, settings=dict(self.settings),
-            judge_weights=weights_digest(self.judge.params), text_encoder=self.encoder.identity, **extra,
-        )  # fmt: skip
+        seen = {"judge_weights": weights_digest(self.judge.params), "text_encoder": self.encoder.identity}
+        return record_of(profile, data, measurement, settings=dict(self.settings), **seen, **extra)
 
     def num_steps(self, trained: TextModel) -> int | None:
         """Return Euler's steps of a flow; other schedules walk the levels that they have."""
@@ -778,8 +776,8 @@ def measure_hands(
       The table, `records/hands.csv`: a row per model, content, side and caption.
     """
     asked = list(models or ())
-    record = run_record(profile=profile, dataset=data, seed=profile.seed, measurement="hands",
-                        text_encoder=encoder.identity, frames=HAND_FRAMES, raised_from=text_metrics.RAISED)  # fmt: skip
+    told = {"text_encoder": encoder.identity, "frames": HAND_FRAMES, "raised_from": text_metrics.RAISED}
+    record = record_of(profile, data, "hands", **told)
     records = Records(records_folder(profile), record, {"hands": ["model"]}, again=asked)
     rows = {"real clips": lambda: _clip_rows(data, False), "mirrored clips": lambda: _clip_rows(data, True)}
     todo = [{"model": name, "weights": ""} for name in rows]
@@ -809,8 +807,7 @@ def measure_one_caption(
       The table, `records/text_one_caption.csv`: a row a token of the latent, its numbers in columns; `weights` are the
       model's, `autoencoder` those that decode.
     """
-    record = run_record(profile=profile, dataset=data, seed=profile.seed, measurement="text_one_caption",
-                        text_encoder=encoder.identity, caption=ONE_CAPTION)  # fmt: skip
+    record = record_of(profile, data, "text_one_caption", text_encoder=encoder.identity, caption=ONE_CAPTION)
     text, rows = jnp.asarray(embed_captions([ONE_CAPTION], encoder).pooled), []
     for name in models or ["MotionLCM-V2-small"]:
         trained = text_models.load_text_model(text_models.find_text_model(profile.dataset, name), LatentModel)

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import pandas as pd
 from tqdm import tqdm
 
-from f3amd_companion.measuring.runner import Records, records_folder
+from f3amd_companion.measuring.runner import Records, record_of, records_folder
 from f3amd_companion.speed import implementations
 from f3amd_companion.speed.implementations import Workload, jit_round
 from f3amd_companion.speed.machine import describe_machine, device_name, matmul_precision, prepared_at_once
@@ -29,7 +29,7 @@ from f3amd_lib.ground import log
 from f3amd_lib.ground.files import read_toml
 from f3amd_lib.ground.names import check_known, row_label
 from f3amd_lib.ground.profiles import Profile
-from f3amd_lib.ground.records import read_table, run_record, write_table
+from f3amd_lib.ground.records import read_table, write_table
 from f3amd_lib.networks import presets
 from f3amd_lib.networks.conditioning import ConditionEncoder, FiLM
 from f3amd_lib.networks.spectral import FNOBlock
@@ -58,10 +58,8 @@ def _record(prepared: PreparedData, profile: Profile, measurement: str, **extra)
     """Return a record that tells the machine; another machine's rows do not belong in its table."""
     machine = describe_machine()
     lasting = {name: machine[name] for name in ("processor", "cores", "system")}
-    return run_record(
-        profile=profile, dataset=prepared.packed, seed=profile.seed, measurement=measurement,
-        timed_on=lasting | {"device": jax.devices()[0].device_kind}, **extra,
-    )  # fmt: skip
+    timed_on = lasting | {"device": jax.devices()[0].device_kind}
+    return record_of(profile, prepared.packed, measurement, timed_on=timed_on, **extra)
 
 
 def _circumstances() -> dict:
