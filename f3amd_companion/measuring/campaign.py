@@ -177,11 +177,6 @@ class Run:
         parts.append(f"seed{self.seed}")
         return "-".join(filter(None, parts))
 
-    @property
-    def names(self) -> set[str]:
-        """What `chosen` may call it: its preset, its recipe, or this run alone."""
-        return {self.preset, self.recipe, self.name}
-
     def config(self, num_windows: int, batch_size: int) -> TrainingConfig:
         """Return the training config of `EPOCHS` epochs over so many windows, or of the run's own length."""
         steps = (1000 * self.length if self.length else EPOCHS * num_windows) // batch_size
@@ -231,9 +226,10 @@ def chosen(snapshots: Iterable[tuple[Run, int]], only: Collection[str]) -> list[
       ValueError: for a name that is none of the queue's.
     """
     snapshots = list(snapshots)
+    names = [{run.preset, run.recipe, run.name} for run, _ in snapshots]
     for name in only:
-        check_known(name, {name for run, _ in snapshots for name in run.names}, "name in the queue")
-    return [(run, windows) for run, windows in snapshots if not only or not run.names.isdisjoint(only)]
+        check_known(name, set().union(*names), "name in the queue")
+    return [one for one, called in zip(snapshots, names, strict=True) if not only or not called.isdisjoint(only)]
 
 
 def _longest(snapshots: Iterable[tuple[Run, int]]) -> dict[Run, int]:

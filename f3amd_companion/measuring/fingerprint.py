@@ -79,17 +79,13 @@ def _table(figures: pd.DataFrame, **columns) -> pd.DataFrame:
     return pd.DataFrame(rows).assign(**columns)
 
 
-def walk_rows(
-    trained: TrainedModel, packed: PackedMotion, classifier: StyleClassifier, *, num_frames: int = NUM_FRAMES,
-    seed: int = 0,
-) -> pd.DataFrame:  # fmt: skip
-    """Walk every style under both grids and updates in each number of steps.
+def walk_rows(trained: TrainedModel, packed: PackedMotion, classifier: StyleClassifier, seed: int = 0) -> pd.DataFrame:
+    """Walk every style `NUM_FRAMES` long under both grids and updates in each number of steps.
 
     Args:
       trained: the model; one that was not trained with F3AMD's noise keeps its own sampler.
       packed: the data set.
       classifier: for FID and coverage of the styles that it knows.
-      num_frames: of each walk.
       seed: of paths, noise and starting poses.
 
     Returns:
@@ -97,7 +93,7 @@ def walk_rows(
       did not diverge. One step is the same under all four, and listed once.
     """
     styles = list(packed.styles)
-    paths = evaluation_paths(packed, styles, num_frames, seed=seed)
+    paths = evaluation_paths(packed, styles, NUM_FRAMES, seed=seed)
     floors = [real_clips.style_floor(packed, style) for style in styles]
     known = [style for style in styles if style in classifier.styles]
     real = real_features(packed, classifier, known, trained.config.window)
@@ -116,7 +112,7 @@ def walk_rows(
         tables.append(_table(pd.DataFrame(figures, columns=None if figures else ["IRD"]), **columns))
         if all(k in motions for k, style in enumerate(styles) if style in known):
             seen = classify_windows(classifier, [motions[styles.index(style)] for style in known], known)
-            count = min(WINDOWS_PER_STYLE, num_frames // classifier.config.window, *(len(one) for one in real.values()))
+            count = min(WINDOWS_PER_STYLE, NUM_FRAMES // classifier.config.window, *(len(one) for one in real.values()))
             scores = distribution_figures(seen, real, count, np.random.default_rng([seed, 0]))
             tables.append(_table(pd.DataFrame([scores]), **columns))
     return pd.concat(tables, ignore_index=True)

@@ -28,7 +28,7 @@ import pandas as pd
 from f3amd_companion.measuring.campaign import Run, chosen, run_campaign
 from f3amd_companion.measuring.measure import MEASUREMENTS, models_with_weights, protocol_of
 from f3amd_lib.ground.files import locked, write_whole
-from f3amd_lib.ground.names import check_known
+from f3amd_lib.ground.names import check_known, checked_value
 from f3amd_lib.ground.profiles import RESULTS_DIR_VARIABLE, Profile
 from f3amd_lib.ground.records import kept_rows, read_table, record_hash, write_table
 from f3amd_lib.ground.trees import weights_digest
@@ -251,8 +251,7 @@ def run_sweep(
       ImportError: without Dask distributed.
       ValueError: for fewer workers than one, or a scheduler that does not answer.
     """
-    if workers < 1:
-        raise ValueError(f"--workers must be at least 1, got {workers}")
+    checked_value("--workers", workers, "int")
     try:
         import dask
         from distributed import Client, LocalCluster, as_completed

@@ -218,15 +218,13 @@ def measure_synthesis_time(
 
 
 def measure_training_time(
-    prepared: PreparedData, profile: Profile, *, precision: str = "float32", again: bool = False,
-    stop_at: float | None = None,
+    prepared: PreparedData, profile: Profile, *, again: bool = False, stop_at: float | None = None
 ) -> Path | None:  # fmt: skip
     """Time training steps alternately: the recommended models, the baseline, and two other widths (Table 2).
 
     Args:
       prepared: the data; an epoch is once over its training windows.
       profile: names the results' folder; says how large a batch is and how many steps are timed.
-      precision: of matrix products, a key of `machine.PRECISIONS`.
       again: time them anew though an earlier run with the same settings has timed all of them.
       stop_at: do not begin after this time (`time.monotonic`).
 
@@ -245,13 +243,13 @@ def measure_training_time(
         return None
     recipe = partial(short_recipe, num_steps=steps, batch_size=batch_size, seed=profile.seed)
     tasks = {name: prepared.task(name, recipe(name)) for name in _TRAINED}
-    programs = prepared_at_once(lambda name: compiled_steps(tasks[name], chunk, precision), _TRAINED)
+    programs = prepared_at_once(lambda name: compiled_steps(tasks[name], chunk, "float32"), _TRAINED)
     compiled = {name: program() for name, program in tqdm(programs.items(), unit="compiled")}
     calls = {name: training_call(tasks[name], program) for name, (program, _) in compiled.items()}
     timings = take_turns(calls, min_rounds=-(-steps // chunk), min_seconds=float("inf"), warmup=2, progress=True)
     windows, circumstances, rows = prepared.windows("train").num_windows, _circumstances(), []
     for row, (name, timing) in zip(named, timings.items(), strict=True):
-        row |= {"precision": precision} | timing.columns("s/step", 1.0 / chunk)
+        row |= {"precision": "float32"} | timing.columns("s/step", 1.0 / chunk)
         row |= {"steps_timed": timing.rounds * chunk, "compile_seconds": round(compiled[name][1], 1)}
         row |= {"epoch_windows": windows, "epoch_minutes": timing.median / chunk * windows / batch_size / 60.0}
         rows.append(row | {"peak_memory_mib": planned_memory(compiled[name][0]) / 2**20})

@@ -40,6 +40,9 @@ class Workload:
       steps: N.
       characters: B.
       precision: of `machine.PRECISIONS`.
+
+    Raises:
+      ValueError: for an unknown precision.
     """
 
     model: str
@@ -47,6 +50,9 @@ class Workload:
     steps: int
     characters: int
     precision: str = "float32"
+
+    def __post_init__(self):
+        matmul_precision(self.precision)
 
     @property
     def sampler(self) -> str:

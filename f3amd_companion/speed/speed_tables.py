@@ -39,10 +39,9 @@ def speed_bars(times: pd.DataFrame, *, suite: str = "main") -> pd.DataFrame:
         fastest = [_fastest(times, bar["characters"], *system) for system in bar["systems"]]
         measured, way, met = None, "", "not measured"
         if all(row is not None for row in fastest):
+            one, *other = fastest
             way = " / ".join(row["way"] for row in fastest)
-            measured = fastest[0]["share_of_peak"]
-            if len(fastest) == 2:
-                measured = fastest[0]["value"] / fastest[1]["value"]
+            measured = one["value"] / other[0]["value"] if other else one["share_of_peak"]
             holds = {">=": operator.ge, "<=": operator.le, "reported": lambda one, other: True}[sign]
             met = "yes" if holds(measured, bound) else "no"
         asked = sign if bound is None else f"{sign} {bound}"
