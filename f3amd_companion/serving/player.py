@@ -236,8 +236,7 @@ def describe_for_web(skeleton: Skeleton) -> dict:
     def numbers(values):
         return [round(float(value), 5) for value in values]
 
-    tips = [offset for _, offset in skeleton.end_sites]
-    offsets = [*skeleton.offsets, *tips]
+    offsets = [*skeleton.offsets, *(offset for _, offset in skeleton.end_sites)]
     capsules = [
         [one.joint, numbers(one.start), numbers(one.end), numbers(one.radii), numbers(one.wide)]
         for one in body_capsules(skeleton)
