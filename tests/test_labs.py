@@ -302,7 +302,9 @@ def test_a_wrong_answer_fails_for_its_reason(number, answer, reason):
 
 
 def test_evaluations_are_counted_in_rows_and_not_inside_a_compiled_walk():
-    scan = lambda denoise, x, top, bottom, count: samplers.sample("ddim", denoise, x, np.geomspace(top, bottom, 9))
+    scan = lambda denoise, x, top, bottom, count: samplers.sample(
+        "ddim", denoise, jax.numpy.asarray(x), np.geomspace(top, bottom, 9)
+    )
     assert "cannot be counted" in judge("L1", scan, 0).fault
     at_once = lambda denoise, x, *given: of("L1")["answer"](
         lambda y, s: denoise(np.tile(y, (3, 1)), s)[: len(y)], x, *given

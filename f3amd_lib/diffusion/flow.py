@@ -6,12 +6,12 @@ alpha x0 + sigma eps itself and a time. On the straight path a DDIM step is Eule
 
 from collections.abc import Callable
 
-import jax.numpy as jnp
 import numpy as np
 
 from f3amd_lib.diffusion.predictions import OBJECTIVES, on_grid
 from f3amd_lib.diffusion.samplers import SAMPLERS, sample
 from f3amd_lib.diffusion.schedules import NoiseSchedule
+from f3amd_lib.ground.arrays import jnp
 from f3amd_lib.ground.names import check_known
 
 DORMAND_PRINCE = "dormand_prince"

@@ -4,10 +4,9 @@ Wrappers take callables of (x_noisy, sigma), the variance-exploding state, and r
 describe one and the same walk: with an exact network every kind of prediction gives the same samples.
 """
 
-import jax.numpy as jnp
-
 from f3amd_lib.diffusion.samplers import Denoiser
 from f3amd_lib.diffusion.schedules import alpha_bar_from_sigma
+from f3amd_lib.ground.arrays import array_module
 
 OBJECTIVES = ("x0", "eps", "v")
 """What a network may be trained to predict from a state alpha x0 + sigma eps: the motion, the noise, or v = x0 - eps,
@@ -48,7 +47,7 @@ def on_grid(predict, objective: str, times, alphas, sigmas, levels=None) -> Deno
     visited = sigmas if levels is None else levels
 
     def denoise(x_noisy, level):
-        place = jnp.argmin(jnp.abs(visited - level))
+        place = abs(visited - level).argmin()
         alpha, sigma = alphas[place], sigmas[place]
         state = x_noisy if levels is None else alpha * x_noisy
         return clean_estimate(objective, predict(state, times[place]), state, alpha, sigma)
@@ -69,7 +68,7 @@ def from_velocity(predict) -> Denoiser:
 
     def denoise(x_noisy, sigma):
         alpha_bar = alpha_bar_from_sigma(sigma)
-        return alpha_bar * x_noisy - jnp.sqrt(1.0 - alpha_bar) * predict(x_noisy, sigma)
+        return alpha_bar * x_noisy - array_module(alpha_bar).sqrt(1.0 - alpha_bar) * predict(x_noisy, sigma)
 
     return denoise
 

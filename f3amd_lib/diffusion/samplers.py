@@ -5,8 +5,8 @@ of Eq. 8. What it wraps (a network with an encoded condition, or an exact mixtur
 no concern of this module.
 
 There is one walk down a falling list of noise levels, and a sampler is how it takes a step. `sample`
-walks in one compiled scan; `walk` is the same in plain Python and yields every state on the way, so
-that it can be printed, drawn and recorded.
+walks a JAX array in one compiled scan; `walk` is the same in plain Python and yields every state on the
+way, so that it can be printed, drawn and recorded. Numpy's arrays stay numpy's, in their own precision.
 
 The paper prints the DDIM update in variance-preserving form (Appendix F). Its state is
 `z = sqrt(alpha_bar) x`, and a network trained on `x` must be shown `z / sqrt(alpha_bar)`. Both
@@ -15,18 +15,20 @@ noise, does not. That third walk is here as well, to be studied (`ddim_step_lite
 written for the variance-exploding state, in which its update has no alpha_bar at all.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
+import numpy as np
 
 from f3amd_lib.diffusion.schedules import alpha_bar_from_sigma
-from f3amd_lib.ground.arrays import array_module
+from f3amd_lib.ground.arrays import array_module, jax
 from f3amd_lib.ground.names import check_known
 
-Denoiser = Callable[[jax.Array, jax.Array], jax.Array]
+Denoiser = Callable  # of a state and its noise level
 
 
 def add_noise(x0, sigma, noise):
@@ -180,8 +182,9 @@ class Sampler:
 def _ddim_vp(x_noisy, x0_hat, sigma, sigma_next):
     """Step in the VP state, with the rescaling before the network that Appendix F leaves unsaid."""
     alpha_bar, alpha_bar_next = alpha_bar_from_sigma(sigma), alpha_bar_from_sigma(sigma_next)
-    z = jnp.sqrt(alpha_bar) * x_noisy
-    return ddim_step_vp(z, x0_hat, alpha_bar, alpha_bar_next) / jnp.sqrt(alpha_bar_next)
+    xp = array_module(x_noisy, sigma)
+    z = xp.sqrt(alpha_bar) * x_noisy
+    return ddim_step_vp(z, x0_hat, alpha_bar, alpha_bar_next) / xp.sqrt(alpha_bar_next)
 
 
 def _euler(x_noisy, x0_hat, sigma, sigma_next):
@@ -218,7 +221,8 @@ def _legs(name: str, x_init, sigmas, alphas, key) -> tuple[Sampler, tuple]:
     is told.
     """
     check_known(name, SAMPLERS, "sampler")
-    sampler, sigmas = SAMPLERS[name], jnp.asarray(sigmas, dtype=jnp.result_type(x_init))
+    xp = array_module(x_init, sigmas, key)
+    sampler, sigmas = SAMPLERS[name], xp.asarray(sigmas, dtype=xp.result_type(x_init))
     if sigmas.ndim != 1 or len(sigmas) < 2:
         raise ValueError(
             f"sigmas must be [N + 1] with at least one step, got shape {sigmas.shape}; "
@@ -226,10 +230,12 @@ def _legs(name: str, x_init, sigmas, alphas, key) -> tuple[Sampler, tuple]:
         )
     if sampler.draws_noise and key is None:
         raise ValueError(f"sampler {name!r} draws fresh noise at every step: give it a key")
-    keys = jax.random.split(key, len(sigmas) - 1) if sampler.draws_noise else None
+    keys = None
+    if sampler.draws_noise:
+        keys = [key] * (len(sigmas) - 1) if xp is np else jax.random.split(key, len(sigmas) - 1)
     if alphas is None:
         return sampler, (sigmas[:-1], sigmas[1:], keys)
-    alphas = jnp.asarray(alphas, dtype=sigmas.dtype)
+    alphas = xp.asarray(alphas, dtype=sigmas.dtype)
     if name != "ddim" or alphas.shape != sigmas.shape:
         raise ValueError(
             f"alphas are for 'ddim' alone, one for each of the {len(sigmas)} sigmas; got {alphas.shape} for {name!r}"
@@ -244,20 +250,21 @@ def _take(sampler: Sampler, denoise: Denoiser, x_noisy, leg: tuple, *, last: boo
     if last and sampler.last:
         return sampler.last(x_noisy, x0_hat, sigma, sigma_next), x0_hat
     if sampler.draws_noise:
-        more = [jax.random.normal(key, x_noisy.shape, x_noisy.dtype)]
+        draw = key.standard_normal if isinstance(key, np.random.Generator) else partial(jax.random.normal, key)
+        more = [draw(x_noisy.shape, x_noisy.dtype)]
     if sampler.evaluations > 1:
         more = [denoise]
     return sampler.step(x_noisy, x0_hat, sigma, sigma_next, *more), x0_hat
 
 
 def _pick(legs: tuple, which) -> tuple:
-    return jax.tree.map(lambda field: field[which], legs)
+    return tuple(field if field is None else field[which] for field in legs)
 
 
 def sample(name: str, denoise: Denoiser, x_init, sigmas, *, alphas=None, key=None, unroll: bool = False) -> jax.Array:
     """Walk a state down the noise levels, in one scan: the variance-exploding one unless `alphas` are given.
 
-    A denoiser that prints or records what it is shown gets tracers here, not numbers: take `walk`.
+    With JAX a denoiser that prints or records what it is shown gets tracers here, not numbers: take `walk`.
 
     Args:
       name: of `SAMPLERS`.
@@ -266,7 +273,7 @@ def sample(name: str, denoise: Denoiser, x_init, sigmas, *, alphas=None, key=Non
       sigmas: [N + 1], falling, the last may be 0 (a schedule's `grid`).
       alphas: [N + 1], what is left of the signal at each of `sigmas` (a schedule's `scaled_grid`), for "ddim" alone:
         the state, which the denoiser sees, is then alpha x0 + sigma noise.
-      key: JAX random key, needed by "ddpm"; the others draw nothing and leave it alone.
+      key: JAX random key, or numpy's generator for a numpy state, needed by "ddpm"; the others draw nothing.
       unroll: write the steps out one by one instead of a `lax.scan` (for exports). The walk is then
         free of loops, but JAX's default random numbers bring one of their own; those of
         `jax.random.key(seed, impl="unsafe_rbg")` do not.
@@ -281,10 +288,11 @@ def sample(name: str, denoise: Denoiser, x_init, sigmas, *, alphas=None, key=Non
     sampler, legs = _legs(name, x_init, sigmas, alphas, key)
     # What ends otherwise ends apart: masked inside the scan, it would cost an evaluation that nobody uses.
     alike = len(legs[0]) - (sampler.last is not None)
-    if unroll or alike < 2:  # a scan keeps its loop around a single step, and also around none
+    # A scan keeps its loop around a single step, and also around none.
+    if unroll or alike < 2 or array_module(legs[0]) is np:
         return [*walk(name, denoise, x_init, sigmas, alphas=alphas, key=key)][-1].x_noisy
     over = lambda x_noisy, leg: (_take(sampler, denoise, x_noisy, leg)[0], None)
-    x_noisy, _ = jax.lax.scan(over, jnp.asarray(x_init), _pick(legs, slice(alike)))
+    x_noisy, _ = jax.lax.scan(over, jax.numpy.asarray(x_init), _pick(legs, slice(alike)))
     return _take(sampler, denoise, x_noisy, _pick(legs, -1), last=True)[0] if sampler.last else x_noisy
 
 
@@ -309,7 +317,7 @@ def walk(name: str, denoise: Denoiser, x_init, sigmas, *, alphas=None, key=None)
       ValueError: as `sample`.
     """
     sampler, legs = _legs(name, x_init, sigmas, alphas, key)
-    x_noisy, last = jnp.asarray(x_init), len(legs[0]) - 1
+    x_noisy, last = array_module(legs[0]).asarray(x_init), len(legs[0]) - 1
     for number in range(last + 1):
         leg = _pick(legs, number)
         x_next, x0_hat = _take(sampler, denoise, x_noisy, leg, last=number == last)

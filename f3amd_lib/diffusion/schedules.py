@@ -11,11 +11,9 @@ import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from f3amd_lib.ground.arrays import array_module
+from f3amd_lib.ground.arrays import array_module, jax, jnp
 from f3amd_lib.ground.names import check_known
 
 

@@ -2,14 +2,29 @@
 
 from __future__ import annotations
 
-import jax
-import jax.numpy as jnp
+import importlib
+import sys
+
 import numpy as np
+
+
+class _Later:
+    """A module that is imported when something of it is asked for: what does without it runs where it is missing."""
+
+    def __init__(self, name: str):
+        self._name = name
+
+    def __getattr__(self, word: str):
+        return getattr(importlib.import_module(self._name), word)
+
+
+jax, jnp = _Later("jax"), _Later("jax.numpy")
 
 
 def array_module(*arrays):
     """Return `jax.numpy` if any argument is a JAX array (or tracer), else `numpy`."""
-    return jnp if any(isinstance(array, jax.Array) for array in arrays) else np
+    loaded = sys.modules.get("jax")
+    return loaded.numpy if loaded and any(isinstance(array, loaded.Array) for array in arrays) else np
 
 
 def exact_products():

@@ -10,14 +10,12 @@ consistency, its baseline (Dai et al. 2024).
 from collections.abc import Callable
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from f3amd_lib.diffusion.predictions import clean_estimate, on_grid
 from f3amd_lib.diffusion.samplers import ddim_step, sample
 from f3amd_lib.diffusion.schedules import NoiseSchedule
-from f3amd_lib.ground.arrays import array_module
+from f3amd_lib.ground.arrays import array_module, jax, jnp
 from f3amd_lib.ground.names import check_known
 
 
@@ -86,7 +84,7 @@ def beside(x, state):
 
 def noised(schedule: NoiseSchedule, x0, noise, time):
     """Return alpha x0 + sigma noise at level numbers `time`, [B] or a scalar; x0 and noise [B, ...]."""
-    alpha, sigma = (beside(share, x0) for share in shares(schedule, time))
+    alpha, sigma = (beside(share, x0) for share in shares(schedule, time, array_module(x0, noise)))
     return alpha * x0 + sigma * noise
 
 
@@ -125,7 +123,7 @@ def target_end(schedule: NoiseSchedule, state, eps, time, edge):
       schedule, state, eps, time: as of `jump`.
       edge: time of the phase's end, like time.
     """
-    return jnp.where(beside(time <= edge, state), state, jump(schedule, state, eps, time, edge))
+    return array_module(state, eps).where(beside(time <= edge, state), state, jump(schedule, state, eps, time, edge))
 
 
 def consistency_answer(teacher: Callable, target: Callable, x_noisy, sigma, sigma_next, sigma_edge=0.0):
@@ -145,11 +143,12 @@ def consistency_answer(teacher: Callable, target: Callable, x_noisy, sigma, sigm
     Source: MotionPCM section 4.2 and Algorithm 1, lines 8 to 10.
     """
     # A denoiser is not asked at level 0; what it says in that place is not taken.
-    asked = jnp.where(sigma_next > sigma_edge, sigma_next, sigma)
+    xp = array_module(x_noisy, sigma, sigma_next, sigma_edge)
+    asked = xp.where(sigma_next > sigma_edge, sigma_next, sigma)
     level, level_next, level_asked, edge = (beside(s, x_noisy) for s in (sigma, sigma_next, asked, sigma_edge))
     solved = ddim_step(x_noisy, teacher(x_noisy, sigma), level, level_next)
     jumped = ddim_step(solved, target(solved, asked), level_asked, edge)
-    end = jnp.where(level_next > edge, jumped, solved)
+    end = xp.where(level_next > edge, jumped, solved)
     kept = edge / level  # share of the state's noise that is left at the end
     return (end - kept * x_noisy) / (1.0 - kept)
 
@@ -164,29 +163,31 @@ def noise_travel(schedule: NoiseSchedule, state, time, time_next, noise):
 
     Source: PCM's noise travel; MotionPCM section 4.3 and Appendix A.4.
     """
-    alpha, alpha_next = (beside(shares(schedule, t)[0], state) for t in (time, time_next))
+    xp = array_module(state, noise)
+    alpha, alpha_next = (beside(shares(schedule, t, xp)[0], state) for t in (time, time_next))
     r = (alpha_next / alpha) ** 2
-    return jnp.sqrt(r) * state + jnp.sqrt(jnp.maximum(1.0 - r, 0.0)) * noise
+    return xp.sqrt(r) * state + xp.sqrt(xp.maximum(1.0 - r, 0.0)) * noise
 
 
 def pseudo_huber(difference, width):
     """Return sqrt(d^2 + h^2) - h of every number: d^2 / (2 h) near 0, |d| - h far away (MotionPCM Eq. 12)."""
-    return jnp.sqrt(difference**2 + width**2) - width
+    return array_module(difference).sqrt(difference**2 + width**2) - width
 
 
-def consistency_scales(time):
+def consistency_scales(time, xp=jnp):
     """Return MotionLCM's (c_skip, c_out) at a level number: (1, 0) at time 0, and nearly (0, 1) from time 1 on.
 
     Its network answers c_skip z + c_out x0, all the way to the data: MotionPCM Eq. 9 with one phase.
     """
-    square = 100.0 * jnp.asarray(time, jnp.float32) ** 2
-    return 0.25 / (square + 0.25), jnp.sqrt(square / (square + 0.25))
+    square = 100.0 * xp.asarray(time, xp.float32) ** 2
+    return 0.25 / (square + 0.25), xp.sqrt(square / (square + 0.25))
 
 
 def latent_consistency_end(schedule: NoiseSchedule, state, eps, time):
     """Return what MotionLCM's network says of the data; arguments as of `jump`."""
-    alpha, sigma = (beside(x, state) for x in shares(schedule, time))
-    c_skip, c_out = (beside(x, state) for x in consistency_scales(time))
+    xp = array_module(state, eps)
+    alpha, sigma = (beside(x, state) for x in shares(schedule, time, xp))
+    c_skip, c_out = (beside(x, state) for x in consistency_scales(time, xp))
     return c_skip * state + c_out * clean_estimate("eps", eps, state, alpha, sigma)
 
 
@@ -238,8 +239,9 @@ def follow(predict: Callable, schedule: NoiseSchedule, noise, times) -> jax.Arra
     Returns:
       State at the last time; at time 0 it still has a little noise, alpha_0 = 0.9996 in MotionPCM's schedule.
     """
-    times = jnp.asarray(times)
-    alphas, sigmas = shares(schedule, times)
+    xp = array_module(noise)
+    times = xp.asarray(times)
+    alphas, sigmas = shares(schedule, times, xp)
     return sample("ddim", on_grid(predict, "eps", times, alphas, sigmas), noise, sigmas, alphas=alphas)
 
 

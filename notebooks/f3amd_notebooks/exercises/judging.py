@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from f3amd_lib.diffusion import samplers
 from scipy.stats import norm
@@ -92,5 +90,4 @@ def normal_quantiles(count: int) -> np.ndarray:
 
 def sample(sampler: str, denoise, x_init, sigmas) -> np.ndarray:
     """Return where a sampler of the library ends, in float64."""
-    with jax.enable_x64(True):
-        return np.asarray(samplers.sample(sampler, denoise, jnp.asarray(x_init), sigmas))
+    return np.asarray(samplers.sample(sampler, denoise, x_init, sigmas))

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import functools
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from f3amd_lib.diffusion.oracles import GaussianMixture
 from f3amd_lib.diffusion.samplers import SAMPLERS, ddim_step, ddim_step_literal
@@ -86,14 +84,14 @@ def _stranger(name: str, rescales: bool = True):
     """Return a sampler of the library in plain Python; one that does not rescale shows the network VP states."""
 
     def sampler(denoise, x_init, sigmas):
-        kind, x = SAMPLERS[name], jnp.asarray(x_init)
+        kind, x, rng = SAMPLERS[name], np.asarray(x_init), np.random.default_rng(0)
         look = denoise if rescales else lambda x, sigma: denoise(x / np.hypot(1, sigma), sigma)
-        for number, (sigma, sigma_next) in enumerate(zip(sigmas[:-1], sigmas[1:], strict=True)):
+        for sigma, sigma_next in zip(sigmas[:-1], sigmas[1:], strict=True):
             leg = x, denoise(x, sigma), sigma, sigma_next
             if kind.last and sigma_next == 0:
                 x = kind.last(*leg)
             else:
-                noise = [jax.random.normal(jax.random.key(number), x.shape)] if kind.draws_noise else []
+                noise = [rng.standard_normal(x.shape)] if kind.draws_noise else []
                 x = kind.step(*leg, *noise, *[look] * (kind.evaluations - 1))
             x = x if rescales else x / np.hypot(1, sigma_next)
         return x
@@ -104,7 +102,7 @@ def _stranger(name: str, rescales: bool = True):
 def _in_preserving_state(denoise, x_init, sigmas):
     """DDIM that keeps z = x / sqrt(1 + sigma^2) and shows the network z times sqrt(1 + sigma^2)."""
     size = np.hypot(1, np.asarray(sigmas))
-    z = jnp.asarray(x_init) / size[0]
+    z = np.asarray(x_init) / size[0]
     for number, (sigma, sigma_next) in enumerate(zip(sigmas[:-1], sigmas[1:], strict=True)):
         x = z * size[number]
         z = ddim_step_literal(x, denoise(x, sigma), sigma, sigma_next)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import jax
 import numpy as np
 import pandas as pd
 from f3amd_lib.diffusion.oracles import GaussianMixture
@@ -49,7 +49,8 @@ class Counted:
 
 def _is_compiled(x) -> bool:
     """Return whether a program is being written down with x in it; derivatives alone are no obstacle."""
-    while isinstance(x, jax.core.Tracer):
+    loaded = sys.modules.get("jax")
+    while loaded and isinstance(x, loaded.core.Tracer):
         if hasattr(x, "primal") or hasattr(x, "batch_dim"):
             x = x.primal if hasattr(x, "primal") else x.val
         else:
