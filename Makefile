@@ -111,7 +111,7 @@ web-tools: $(VENV)/extra-web ## Add selenium to .venv, and Chromium to the syste
 test-web: web-tools onnx-tools ## Test the pages in headless Chromium (F3AMD_SCREENSHOTS=folder keeps pictures)
 	$(PYTEST) $(NO_NOTEBOOKS) tests/web $(SIDE_BY_SIDE:loadfile=loadgroup) $(PYTEST_OPTIONS)
 
-site-tools: $(VENV)/extra-site ## Add Sphinx, its theme and MathJax to .venv (about 80 MB)
+site-tools: $(VENV)/extra-site ## Add Sphinx, its theme, MathJax and JupyterLite to .venv (about 100 MB)
 
 # From nothing each time, so that no page outlives its source. A warning is an error.
 site: site-tools onnx-tools ## Build notebooks, claims, gallery and API as a site: docs/_build/html/index.html
@@ -119,6 +119,7 @@ site: site-tools onnx-tools ## Build notebooks, claims, gallery and API as a sit
 	JAX_PLATFORMS=cpu $(PYTHON) -m sphinx -q -j auto -W --keep-going -c docs -d docs/_build/doctrees \
 	  . docs/_build/html
 	JAX_PLATFORMS=cpu $(PYTHON) docs/players.py docs/_build/html
+	$(PYTHON) docs/lite.py docs/_build/html
 	$(PYTHON) docs/check_links.py docs/_build/html
 
 lint: $(INSTALLED) ## Check .py and .ipynb files with ruff, and that each import is declared

@@ -68,6 +68,19 @@ def remove_templates(app, exception) -> None:
             path.unlink()
 
 
+# A browser's own Python --------------------------------------------------------------------------
+
+
+def open_in_a_tab(app, pagename, templatename, context, doctree) -> None:
+    """Give each notebook of the course a button that opens it in JupyterLite, which `docs/lite.py` puts beside it."""
+    if pagename.startswith("notebooks/course/") and "header_buttons" in context:
+        address = f"lite/notebooks/index.html?path={pagename.rpartition('/')[2]}.ipynb"
+        context["header_buttons"].append(
+            {"type": "link", "text": "Run in the browser", "tooltip": "Run this notebook in your browser",
+             "icon": "fas fa-play", "label": "run-in-the-browser", "url": context["pathto"](address, resource=True)}
+        )  # fmt: skip
+
+
 # Alternative texts --------------------------------------------------------------------------------
 
 
@@ -183,5 +196,6 @@ def setup(app):
     app.connect("html-page-context", describe_page)
     app.connect("build-finished", draw_preview)
     app.connect("env-updated", forget_sourceless)
+    app.connect("html-page-context", open_in_a_tab, priority=900)  # after the theme's own buttons
     app.connect("build-finished", remove_templates)
     return {"version": "1", "parallel_read_safe": True, "parallel_write_safe": True}
