@@ -11,6 +11,7 @@ import json
 import re
 import runpy
 import sys
+import zipfile
 from pathlib import Path
 
 import nbformat
@@ -183,6 +184,33 @@ def test_setup_is_folded_and_only_the_very_same_figure_is_shown_in_full_size():
     same, other = cells[3].outputs
     assert base64.b64decode(same.data["image/png"]) == full
     assert other.data == data and "width" not in other.metadata["image/png"] and "width" in same.metadata["image/png"]
+
+
+# Notebooks elsewhere
+
+
+def test_every_notebook_fetches_the_library_from_the_address_of_the_project(tmp_path, monkeypatch):
+    cells = load(ROOT / "scripts" / "install_cell.py")
+    assert len(cells.NOTEBOOKS) > 35
+    for path in cells.NOTEBOOKS:
+        text = path.read_text(encoding="utf-8")
+        assert cells.with_cell(text) == text, f"{path.name}: run scripts/install_cell.py"
+    (tmp_path / "pyproject.toml").write_text('[project]\nurls.Repository = "https://github.com/owner/name"')
+    monkeypatch.setattr(cells, "ROOT", tmp_path)
+    assert 'repository = "https://github.com/owner/name"' in json.loads(cells.with_cell(text))["cells"][1]["source"][3]
+
+
+def test_the_browser_gets_the_course_with_a_wheel_that_it_can_install(tmp_path):
+    lite = load(DOCS / "lite.py")
+    with zipfile.ZipFile(lite.write_wheel(tmp_path)) as wheel:
+        names = wheel.namelist()
+        (about,) = (name for name in names if name.endswith("METADATA"))
+        needs = re.findall(r"^Requires-Dist: (\w+)$", wheel.read(about).decode(), re.M)
+    assert {"numpy", "scipy", "pandas", "matplotlib", "pillow"} == set(needs)
+    assert {"f3amd_lib/drawing/colors.toml", "f3amd_notebooks/labs/__init__.py"} <= set(names)
+    assert not [name for name in names if name.endswith((".safetensors", ".pyc"))]
+    notebook = lite.in_a_tab(json.loads((ROOT / "notebooks/course/01_score.ipynb").read_text(encoding="utf-8")))
+    assert sum(cell["source"] == "%pip install -q f3amd_lib" for cell in notebook["cells"]) == 1
 
 
 # Docstrings

@@ -4,7 +4,7 @@
 (() => {
   const sum = (values) => values.reduce((total, value) => total + value, 0);
   const mean = (values) => sum(values) / values.length;
-  const even = (from, to, steps) => Array.from({ length: steps + 1 }, (_, k) => from + ((to - from) * k) / steps);
+  const even = (from, to, steps) => Array.from({ length: steps + 1 }, (_, k) => from + ((to - from) * k) / (steps || 1));
   const geometric = (from, to, steps) => even(Math.log(from), Math.log(to), steps).map(Math.exp);
   const pair = { means: [-1, 1], width: 0.3 };
   const crowd = { means: [-1, 1], width: 0.5 };
@@ -70,20 +70,20 @@
       axes: { x: [1.06, -0.1], names: ["share of the noise that is left", "x"] },
       compute({ noise, place, left, way }) {
         const D = denoiser(pair), sigma = 10 ** noise, lower = left * sigma;
-        const x = place * Math.hypot(Math.hypot(1, 0.3), sigma);
+        const x = place * Math.hypot(1, pair.width, sigma);
         const shares = geometric(1, 0.02, 60);
         const path = walk((D, y, s, l) => flow(D, y, s, l), D, x, shares.map((share) => share * sigma));
         const guess = D(x, sigma), first = euler(D, x, sigma, lower);
         const landed = way ? heun(D, x, sigma, lower) : first, right = flow(D, x, sigma, lower);
         const lines = { "exact flow": shares.map((share, k) => [share, path[k]]), "to the guess D": [[1, x], [0, guess]] };
         if (way) lines["to the second guess"] = [[left, first], [0, D(first, lower)]];
-        Object.assign(lines, { "step": [[1, x], [left, landed]], "exact": [[left, right]] });
+        Object.assign(lines, { "the step": [[1, x], [left, landed]], exact: [[left, right]] });
         return { lines, says: `D = ${round(guess)}, x′ = ${round(landed)}, off by ${round(landed - right, 3)}` };
       },
     },
     paths: {
-      sliders: { strength: ["fresh noise λ", 0, 2, 0.1, 1, (v) => round(v, 1)], seed: ["draw", 1, 9, 1, 1, String] },
-      axes: { x: [40, 0.02], log: true, y: [-4, 4], names: ["noise level σ", "x"] },
+      sliders: { strength: ["fresh noise λ", 0, 2, 0.1, 1, (v) => round(v, 1)], seed: ["random draw", 1, 9, 1, 1, String] },
+      axes: { x: [40, 0.02], log: true, y: [-3, 3], names: ["noise level σ", "x, in its own spread"] },
       compute({ strength, seed }) {
         const levels = geometric(40, 0.1, STEPS), D = denoiser(pair), noise = normals(seed, WALKERS * (STEPS + 1));
         const walked = Array.from({ length: WALKERS }, (_, n) => {
@@ -97,9 +97,10 @@
         });
         const ends = walked.map((states) => states[STEPS]), centre = mean(ends);
         const spread = Math.sqrt(mean(ends.map((x) => (x - centre) ** 2)));
-        const density = even(-3, 3, 120).map((x) => [0.1 * 0.25 ** Math.exp(logDensity(pair, x, 0.1)), x]);
-        const lines = Object.fromEntries(walked.slice(0, 25).map((states, n) => [n, states.map((x, k) => [levels[k], x])]));
-        return { lines: { ...lines, "exact density at the end": density },
+        const own = (x, sigma) => x / Math.hypot(1, pair.width, sigma);
+        const density = even(-3, 3, 120).map((x) => [0.1 * 0.25 ** Math.exp(logDensity(pair, x, 0.1)), own(x, 0.1)]);
+        const lines = Object.fromEntries(walked.slice(0, 25).map((states, n) => [n, states.map((x, k) => [levels[k], own(x, levels[k])])]));
+        return { lines: { ...lines, "density at the end, exact": density },
                  says: `spread of ${WALKERS} ends ${round(spread)} (exact ${round(Math.sqrt(1.1))})` };
       },
     },
@@ -144,10 +145,10 @@
   globalThis.pictures = Object.assign(pictures, { normals });
 
   // Drawing: what begins like a key looks like its value; the rest is thin and blue.
-  const LOOKS = { "exact flow": "#8A8A8A 2", "to the guess": "#D6604D 1 4", "to the second": "#F1A340 1 4", step: "#542788 3", exact: "#1A1A1A 0",
+  const LOOKS = { "exact flow": "#8A8A8A 2", "to the guess": "#D6604D 1 4", "to the second": "#F1A340 1 4", "the step": "#542788 3", exact: "#1A1A1A 0", density: "#1A1A1A 2",
                   "the crowd": "#8A8A8A 1.5", "the condition": "#92C5DE 2", tilted: "#1A1A1A 2", "what the flow": "#542788 2.5",
                   path: "#8A8A8A 1", guess: "#D6604D 1.2 4", jump: "#542788 2" };
-  const WIDTH = 640, HEIGHT = 300, LEFT = 46, BELOW = 40;
+  const WIDTH = 640, HEIGHT = 300, LEFT = 58, RIGHT = 20, BELOW = 40;
   const svg = (name, attributes, text = "") => {
     const element = document.createElementNS("http://www.w3.org/2000/svg", name);
     Object.entries(attributes).forEach(([key, value]) => element.setAttribute(key, value));
@@ -156,17 +157,18 @@
   };
   const draw = (board, { axes }, { lines }) => {
     const ys = Object.values(lines).flat().map(([, y]) => y);
-    const [low, high] = axes.y || [Math.min(...ys) - 0.2, Math.max(...ys) + 0.2], shown = axes.log ? Math.log : (x) => x;
-    const across = (x) => LEFT + ((WIDTH - LEFT - 8) * (shown(x) - shown(axes.x[0]))) / (shown(axes.x[1]) - shown(axes.x[0]));
+    const [low, high] = axes.y || [Math.min(...ys) - 0.2, Math.max(...ys) + 0.6], shown = axes.log ? Math.log : (x) => x;
+    const across = (x) => LEFT + ((WIDTH - LEFT - RIGHT) * (shown(x) - shown(axes.x[0]))) / (shown(axes.x[1]) - shown(axes.x[0]));
     const up = (y) => HEIGHT - BELOW - ((HEIGHT - BELOW - 8) * (Math.min(Math.max(y, low - 1), high + 1) - low)) / (high - low);
     const words = (x, y, text, anchor = "middle") => svg("text", { x, y, "text-anchor": anchor, "font-size": 12 }, text);
-    const [from, to] = [...axes.x].sort((a, b) => a - b), ticks = axes.log ? [0.01, 0.1, 1, 10] : [0, 0.5, 1, ...even(-3, 5, 8)];
+    const [from, to] = [...axes.x].sort((a, b) => a - b), ticks = axes.log ? [0.01, 0.1, 1, 10] : to - from < 2 ? [0, 0.5, 1] : even(-3, 5, 8);
     board.replaceChildren();
-    new Set(ticks.filter((x) => x >= from && x <= to)).forEach((x) => board.append(words(across(x), HEIGHT - BELOW + 15, x)));
-    even(Math.ceil(low), Math.floor(high), Math.floor(high) - Math.ceil(low)).forEach((y) => board.append(words(LEFT - 6, up(y) + 4, y, "end")));
+    ticks.filter((x) => x >= from && x <= to).forEach((x) => board.append(words(across(x), HEIGHT - BELOW + 15, x)));
+    const every = high - low > 2.5 ? 1 : 0.25, first = every * Math.ceil(low / every), last = every * Math.floor(high / every);
+    even(first, last, (last - first) / every).forEach((y) => board.append(words(LEFT - 4, up(y) + 4, round(y, every < 1 ? 2 : 0), "end")));
     board.append(words((LEFT + WIDTH) / 2, HEIGHT - 6, axes.names[0]), svg("text", { transform: `translate(14 ${HEIGHT / 2 - 15}) rotate(-90)`,
       "text-anchor": "middle", "font-size": 12 }, axes.names[1]));
-    const inside = { x: LEFT, y: 8, width: WIDTH - LEFT - 8, height: HEIGHT - BELOW - 8 };
+    const inside = { x: LEFT, y: 8, width: WIDTH - LEFT - RIGHT, height: HEIGHT - BELOW - 8 };
     const area = svg("svg", { ...inside, viewBox: Object.values(inside).join(" ") }); // nothing is drawn outside of it
     board.append(svg("rect", { ...inside, fill: "none", stroke: "#8A8A8A" }), area);
     let row = 0;
@@ -174,11 +176,11 @@
       const look = Object.keys(LOOKS).find((key) => name.startsWith(key)), [stroke, width, dash] = (LOOKS[look] || "#2166AC 0.7").split(" ");
       const places = points.map(([x, y]) => [across(x), up(y)]);
       area.append(svg("polyline", { points: places.join(" "), fill: "none", stroke, "stroke-width": width, "stroke-dasharray": dash || "none" }));
-      if (["step", "exact", "jump"].includes(look)) places.forEach(([cx, cy]) => area.append(svg("circle", { cx, cy, r: 3.5, fill: stroke })));
+      if (["the step", "exact", "jump"].includes(look)) places.forEach(([cx, cy]) => area.append(svg("circle", { cx, cy, r: 3.5, fill: stroke })));
       if (name.length > 5 && !/ \d$/.test(name)) {
         const y = 24 + 16 * row++;
-        board.append(svg("line", { x1: WIDTH - 178, x2: WIDTH - 160, y1: y - 4, y2: y - 4, stroke, "stroke-width": width, "stroke-dasharray": dash || "none" }),
-          words(WIDTH - 154, y, name, "start"));
+        board.append(svg("line", { x1: WIDTH - 212, x2: WIDTH - 194, y1: y - 4, y2: y - 4, stroke, "stroke-width": width, "stroke-dasharray": dash || "none" }),
+          words(WIDTH - 188, y, name, "start"));
       }
     });
   };

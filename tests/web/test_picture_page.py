@@ -44,7 +44,7 @@ def step(noise, place, left, way):
     return second | {
         "exact flow": [[share, PAIR.flow(x, sigma, share * sigma)] for share in shares],
         "to the guess D": [[1, x], [0, guess]],
-        "step": [[1, x], [left, landed]],
+        "the step": [[1, x], [left, landed]],
         "exact": [[left, PAIR.flow(x, sigma, left * sigma)]],
     }
 
@@ -59,8 +59,9 @@ def paths(strength, seed, normals):
         states.append(x + strength * np.sqrt(sigma**2 - lower**2) * fresh)
     x = np.linspace(-3, 3, 121)
     density = np.exp(PAIR.log_density(x[:, None], 0.1))
-    walked = {str(n): np.stack([levels, np.stack(states)[:, n, 0]], -1) for n in range(25)}
-    return walked | {"exact density at the end": np.stack([0.1 * 0.25**density, x], -1)}
+    own = lambda x, sigma: x / np.sqrt(1 + 0.3**2 + sigma**2)
+    walked = {str(n): np.stack([levels, own(np.stack(states)[:, n, 0], levels)], -1) for n in range(25)}
+    return walked | {"density at the end, exact": np.stack([0.1 * 0.25**density, own(x, 0.1)], -1)}
 
 
 def guidance(w):
