@@ -261,7 +261,7 @@ def _pick(legs: tuple, which) -> tuple:
     return tuple(field if field is None else field[which] for field in legs)
 
 
-def sample(name: str, denoise: Denoiser, x_init, sigmas, *, alphas=None, key=None, unroll: bool = False) -> jax.Array:
+def sample(name: str, denoise: Denoiser, x_init, sigmas, *, alphas=None, key=None, unroll: bool = False):
     """Walk a state down the noise levels, in one scan: the variance-exploding one unless `alphas` are given.
 
     With JAX a denoiser that prints or records what it is shown gets tracers here, not numbers: take `walk`.
@@ -299,9 +299,9 @@ def sample(name: str, denoise: Denoiser, x_init, sigmas, *, alphas=None, key=Non
 class Visited(NamedTuple):
     """One state of a walk: the state, its noise level, and the clean estimate that was made there."""
 
-    x_noisy: jax.Array
-    sigma: jax.Array
-    x0_hat: jax.Array | None
+    x_noisy: jax.Array | np.ndarray
+    sigma: jax.Array | np.ndarray
+    x0_hat: jax.Array | np.ndarray | None
 
 
 def walk(name: str, denoise: Denoiser, x_init, sigmas, *, alphas=None, key=None) -> Iterator[Visited]:

@@ -225,7 +225,7 @@ def ddim_times(num_levels: int, num_steps: int, spacing: str = "trailing") -> np
     return np.append(times, 0)
 
 
-def follow(predict: Callable, schedule: NoiseSchedule, noise, times) -> jax.Array:
+def follow(predict: Callable, schedule: NoiseSchedule, noise, times):
     """Jump from time to time: a student along `Phases.visited`, a teacher along `ddim_times` (MotionPCM section 4.4).
 
     No noise is added on the way, so that noise and condition decide the answer.
