@@ -14,11 +14,10 @@ import tomllib
 from pathlib import Path
 
 DOCS = Path(__file__).resolve().parent
-sys.path[:0] = [str(DOCS / "_ext"), str(DOCS.parent), str(DOCS.parent / "scripts")]
+sys.path[:0] = [str(DOCS / "_ext"), str(DOCS.parent)]
 os.environ.setdefault("JAX_PLATFORMS", "cpu")  # autodoc imports the library; it computes nothing
 
-from install_cell import address  # noqa: E402 (the lines above are what finds it)
-from pages import launch_options  # noqa: E402
+from pages import launch_options  # noqa: E402 (the lines above are what finds it)
 
 project = "F3AMD companion"
 author = copyright = "The F3AMD companion authors"
@@ -110,7 +109,7 @@ html_theme_options = {
     "use_download_button": True,
     "use_fullscreen_button": False,
     "back_to_top_button": True,
-    **launch_options(os.environ.get("F3AMD_REPOSITORY") or address()),
+    **launch_options(os.environ.get("F3AMD_REPOSITORY") or urls.get("repository", "")),
     # The ledger's tables need the width.
     "secondary_sidebar_items": {
         "**": ["page-toc.html"],
