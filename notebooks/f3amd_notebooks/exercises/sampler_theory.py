@@ -49,8 +49,8 @@ def _one_step_spread(answer) -> str | None:
     if agree(spread, ends.std(), rtol=0.1):
         return None
     return (
-        f"this is {too(spread, ends.std())}; at sigma = 128 the data look like one Gaussian of variance v, "
-        "whose denoiser is linear, D = m + c (x - m): how small is c, and how large is x - m?"
+        f"this is {too(spread, ends.std())}; at sigma = 128 the data look like one Gaussian of variance s^2, "
+        "whose denoiser is linear, D = m + g (x - m): how small is g, and how large is x - m?"
     )
 
 

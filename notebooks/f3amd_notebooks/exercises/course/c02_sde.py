@@ -55,7 +55,7 @@ def _two_variances(answer) -> str | None:
     if reordered(found, (old + small, old + large, 1.0 + lower**2), rtol=0.01):
         return f"{OTHER_ORDER}: smaller variance, larger variance, as it should be"
     if agree(found[1], old + gained, rtol=0.01):
-        return "the larger variance is beta_t, in units of sigma (1 + sigma'^2) / (1 + sigma^2) of what the level loses"
+        return "the larger is Ho et al.'s, in units of sigma (1 + sigma'^2) / (1 + sigma^2) of what the level loses"
     for name, value, right in zip(
         ("with the smaller variance x'", "with the larger variance x'", "what x' should have"),
         found,

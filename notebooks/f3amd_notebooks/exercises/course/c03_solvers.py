@@ -54,7 +54,7 @@ def _factors(answer) -> str | None:
             if not agree(value, right, rtol=1e-4):
                 return (
                     f"{name} factor is {too(value, right)}, at s = {s:g} from {sigmas[0]:g} to {sigmas[-1]:g}; "
-                    "a step multiplies by 1 + (sigma' - sigma) (1 - c) / sigma, and the flow keeps x over its deviation"
+                    "a step multiplies by 1 + (sigma' - sigma) (1 - D/x) / sigma; the flow keeps x over its deviation"
                 )
     return None
 

@@ -53,17 +53,17 @@ _MATRICES = (
     np.array([[1.0, 0.3, 0.0], [0.3, 0.4, -2.0], [0.0, -2.0, 3.0]]),
     np.diag([3.0, 1.0, 2.0]),
 )
-# Three nodes of Gauss and Hermite: moments of a normal number up to the fifth are exact, and a square of v J v
+# Three nodes of Gauss and Hermite: moments of a normal number up to the fifth are exact, and a square of ξ J ξ
 # asks for the fourth.
 _NODES, _WEIGHTS = np.array([-np.sqrt(3), 0.0, np.sqrt(3)]), np.array([1, 4, 1]) / 6
 
 
 def _deviation(matrix: np.ndarray, nodes, weights) -> float:
-    """Standard deviation of v J v for independent entries of v with these values and weights, by all combinations."""
+    """Standard deviation of ξ J ξ for independent entries of ξ with these values and weights, by all combinations."""
     size = len(matrix)
-    v = np.array(list(product(nodes, repeat=size)))
+    xi = np.array(list(product(nodes, repeat=size)))
     weight = np.prod(list(product(weights, repeat=size)), axis=1)
-    values = np.einsum("ni,ij,nj->n", v, matrix, v)
+    values = np.einsum("ni,ij,nj->n", xi, matrix, xi)
     return float(np.sqrt(weight @ values**2 - (weight @ values) ** 2))
 
 
@@ -88,7 +88,7 @@ def _one_probe(answer) -> str | None:
             if not agree(value, expected, rtol=1e-3, atol=1e-6):
                 return (
                     f"with {name} the spread is {too(value, expected)}, for the matrix {matrix.tolist()}; multiply "
-                    "v J v out, and ask of each product of entries how much it varies: the square of a sign is always 1"
+                    "ξ J ξ out, and ask of each product of entries how much it varies: the square of a sign is always 1"
                 )
     return None
 
