@@ -119,6 +119,7 @@ site: site-tools onnx-tools ## Build notebooks, claims, gallery and API as a sit
 	JAX_PLATFORMS=cpu $(PYTHON) -m sphinx -q -j auto -W --keep-going -c docs -d docs/_build/doctrees \
 	  . docs/_build/html
 	JAX_PLATFORMS=cpu $(PYTHON) docs/players.py docs/_build/html
+	JAX_PLATFORMS=cpu $(PYTHON) docs/live.py docs/_build/html
 	$(PYTHON) docs/lite.py docs/_build/html
 	$(PYTHON) docs/check_links.py docs/_build/html
 

@@ -102,7 +102,8 @@ def steer_page(
         "style": string.Template(read_web("steer.css")).substitute(marks=marks),
     }
     core, three = (package_file("three", f"build/three.{part}.js").decode() for part in ("core", "module"))
-    modules = {"core": core, "three": three.replace("./three.core.js", "core"), "motion": read_web("motion.js")}
+    modules = {"core": core, "three": three.replace("./three.core.js", "core")}
+    modules |= {name: read_web(f"{name}.js") for name in ("motion", "network")}
     script, wasm = RUNTIMES[runtime]
     files = {"worker": _worker(script).encode(), "wasm": package_file("onnxruntime-web", wasm), "program": program}
     files["poses"] = np.asarray(poses, np.float32).tobytes()

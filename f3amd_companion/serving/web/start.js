@@ -15,7 +15,7 @@
   map.textContent = JSON.stringify({ imports });
   document.head.append(map);
   const { start } = await import(packed.start);
-  await start(files);
+  await start(files, unpack);
 })().catch((error) => {
   const message = document.getElementById("message");
   message.textContent = `This page cannot be shown here: ${error.message}. It needs a browser of 2023 or later with WebGL; ` +

@@ -2,6 +2,7 @@
 import * as THREE from "three";
 import { Bodies } from "body";
 import { FPS, jointPositions, pose } from "motion";
+import { Network } from "network";
 
 const HOP = 8, BLEND = 4, MOST = 32, RECORDED = 1800;
 
@@ -238,33 +239,6 @@ class Picture {
 Picture.up = new THREE.Vector3(0, 1, 0);
 Picture.still = new THREE.Quaternion();
 Picture.matrix = new THREE.Matrix4();
-
-// ------------------------------------------------------------------------------------------------------------ the network
-
-class Network {
-  constructor(url) {
-    this.worker = new Worker(url);
-    this.waiting = new Map();
-    this.next = 0;
-    this.worker.onmessage = ({ data }) => {
-      const { done, failed } = this.waiting.get(data.id);
-      this.waiting.delete(data.id);
-      if (data.error) failed(new Error(data.error));
-      else done(data);
-    };
-    this.worker.onerror = (event) => {
-      for (const { failed } of this.waiting.values()) failed(new Error(event.message || "the worker did not start"));
-    };
-  }
-
-  ask(kind, message = {}, transfer = []) {
-    return new Promise((done, failed) => {
-      const id = this.next++;
-      this.waiting.set(id, { done, failed });
-      this.worker.postMessage({ id, kind, ...message }, transfer);
-    });
-  }
-}
 
 // ---------------------------------------------------------------------------------------------------------------- the game
 

@@ -1,7 +1,7 @@
 // The network, in a worker: ONNX Runtime in WebAssembly on one thread, or by WebGPU, all characters in one call. The page
 // sends what the player wishes, and gets frames back.
 import * as ort from "onnxruntime-web";
-import { advance, lockFrame, normalNumbers, startCharacter, startFeet } from "./motion.js";
+import { advance, lockFrame, normalNumbers, sampleRound, startCharacter, startFeet } from "./motion.js";
 
 let card, session, poses, characters = [], draw = normalNumbers(1);
 
@@ -71,6 +71,12 @@ const answers = {
       });
     });
     return { made, targets: characters.map(({ target }) => target), ms: performance.now() - began };
+  },
+  // One window of a given condition, and how long it took.
+  async sample({ condition, noise, sigmas }) {
+    const began = performance.now();
+    const clean = await sampleRound((x, sigma) => denoise(x, sigma, condition), noise, sigmas);
+    return { clean, ms: performance.now() - began };
   },
 };
 
