@@ -268,7 +268,8 @@ def test_the_page_carries_everything_and_asks_for_nothing(trained, packages, tmp
     data = carried(page, "steer-data")
     assert data["card"]["legs"] is None and 'id="feet" disabled' in page  # legs of these are no legs
     assert data["card"]["styles"] == ["calm", "proud"] and data["card"]["window"] == builders.WINDOW
-    assert set(files) == {"worker", "wasm", "program", "poses"} and set(modules) == {"core", "three", "motion", "steer"}
+    assert set(files) == {"worker", "wasm", "program", "poses"}
+    assert set(modules) == {"core", "three", "motion", "network", "steer"}
     head = page.split('<script type="application/json" id="steer-data">')[0]
     assert "http" not in head.replace("http-equiv", "") and "default-src 'none'" in head
     assert "&lt;nobody&gt;" in head and "CC0" in head and "inertialised" in head
