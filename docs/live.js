@@ -248,6 +248,7 @@ async function steps(figure, { data, arrays, network }) {
 async function ladder(figure, { data: { toes } }) {
   const [bend, top, number, ...axes] = ["#bend", "#top", "#number", ".levels", ".spread", ".plane"].map((name) => figure.querySelector(name));
   const means = Float64Array.from(toes.means.flat()), { width } = toes, modes = toes.means.length, near = new Float64Array(modes);
+  const half = Float64Array.from(toes.means, ([a, b]) => (a * a + b * b) / 2);
   const moments = (x, k) => { // mean and deviation of one coordinate
     const own = x.filter((_, i) => i % 2 === k), mean = own.reduce((sum, value) => sum + value) / own.length;
     return [mean, Math.sqrt(own.reduce((sum, value) => sum + (value - mean) ** 2, 0) / own.length)];
@@ -259,14 +260,14 @@ async function ladder(figure, { data: { toes } }) {
   const denoise = (x, sigma) => { // E[x0 | x]: course notebook 01, `posterior_mean`
     const total = width * width + sigma * sigma, keep = (sigma * sigma) / total, clean = new Float32Array(x.length);
     for (let i = 0; i < x.length; i += 2) {
-      let nearest = Infinity, sum = 0, a = 0, b = 0;
+      let nearest = -Infinity, sum = 0, a = 0, b = 0;
       for (let k = 0; k < modes; k++) {
-        near[k] = ((x[i] - means[2 * k]) ** 2 + (x[i + 1] - means[2 * k + 1]) ** 2) / (2 * total);
-        if (near[k] < nearest) nearest = near[k];
+        near[k] = x[i] * means[2 * k] + x[i + 1] * means[2 * k + 1] - half[k];
+        if (near[k] > nearest) nearest = near[k];
       }
       for (let k = 0; k < modes; k++) {
-        if (near[k] > nearest + 30) continue; // a share of 1e-13
-        const share = Math.exp(nearest - near[k]);
+        if (nearest - near[k] > 30 * total) continue; // a share of 1e-13
+        const share = Math.exp((near[k] - nearest) / total);
         sum += share;
         a += share * means[2 * k];
         b += share * means[2 * k + 1];
