@@ -198,8 +198,11 @@ def test_the_page_holds_everything_and_asks_for_nothing():
     for script in sorted(FOLDER.glob("*.js")):  # three.js names addresses of standards and asks for none
         assert script.name == "three.min.js" or "://" not in script.read_text(), script
     policy = re.search(r'Content-Security-Policy" content="([^"]*)"', page)[1]
-    assert policy.startswith("default-src 'none';")
-    assert all('content="$policy"' in template.read_text() for template in FOLDER.glob("*.html"))
+    assert policy.startswith("default-src 'none';") and "script-src 'unsafe" not in policy
+    (nonce,) = (attributes["nonce"] for tag, attributes in Elements(page).tags if "nonce" in attributes)
+    assert f"'nonce-{nonce}'" in policy and nonce not in player_page(wandering_motion(FRAMES), title="Run")
+    bodies = [template.read_text() for template in FOLDER.glob("*.html") if template.name != "page.html"]
+    assert bodies and not any(re.search(r"<(script|style|head|body)\b|\son\w+=", body) for body in bodies)
     assert not re.search(r"\$[a-z]+\b", page.split('id="player-data"')[0])
 
 

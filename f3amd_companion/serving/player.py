@@ -22,6 +22,7 @@ those of a crowd to a few.
 """
 
 import base64
+import hashlib
 import html
 import json
 import string
@@ -45,10 +46,10 @@ FOLDER = Path(__file__).parent / "web"
 """Scripts, styles and templates of pages. The modules import each other by name."""
 
 POLICY = (
-    "default-src 'none'; base-uri 'none'; form-action 'none'; style-src 'unsafe-inline'; img-src data: blob:; "
-    "connect-src blob:; script-src 'unsafe-inline' blob:"
+    "default-src 'none'; base-uri 'none'; form-action 'none'; style-src 'unsafe-inline'; img-src data:; "
+    "script-src blob: 'nonce-{}'"
 )
-"""Content security policy of a page: what it carries, and no request to anybody. Others add to its end, the scripts."""
+"""Content security policy of every page: what it carries, no request to anybody, no script that stands in markup."""
 
 _MILLIMETRES = 1000.0
 _FINE, _COARSE = 4096, 1024  # steps a radian, of a few characters and of more than `_FEW`
@@ -152,11 +153,9 @@ def player_page(scenes, *, title: str = "", credit: str = "", autoplay: bool = T
     }
     named = title or ", ".join(scene.title for scene in scenes if scene.title) or "Motion"
     texts = {
-        "policy": POLICY,
         "title": html.escape(named),
         "heading": _element("h1", title),
         "colors": _color_rules(),
-        "style": read_web("player.css"),
         "panels": "\n".join(_panel(scene, first) for scene in scenes),
         "credit": _element('p class="credit"', credit),
     }
@@ -309,25 +308,31 @@ def read_web(name: str) -> str:
     return "\n".join(line for line in stripped if line and not line.startswith("//"))
 
 
-def whole_page(name: str, texts: dict, data, modules: dict, files: Mapping[str, bytes] = MappingProxyType({})) -> str:
-    """Fill the template of a page, with its modules and files inside.
+def whole_page(
+    name: str, texts: dict, data, modules: dict, files: Mapping[str, bytes] = MappingProxyType({}), policy: str = ""
+) -> str:
+    """Make a page of `web/page.html`, with its style, modules and files inside and a content security policy.
 
     They are carried compressed; `web/start.js` unpacks them, tells the browser the modules' names in an import map, and
     calls `start(files)` of the one that is called as the page. Browsers of 2023 and later can do that (Chrome 89,
     Firefox 113, Safari 16.4).
 
     Args:
-      name: of the template, which has an element "message" (hidden), and of the module; both in `serving/web`.
-      texts: what the template asks for, ready for HTML; its policy has to allow `blob:` scripts.
-      data: what stands as JSON in the page.
+      name: of the body (.html), style (.css) and module (.js), all in `serving/web`.
+      texts: the page's title and what body and style ask for, ready for HTML.
+      data: what stands as JSON in the page's element "NAME-data".
       modules: other JavaScript, by the name by which it is imported.
       files: what `start` is given.
+      policy: what scripts may do besides, added to the end of `POLICY`.
     """
     pack = lambda part: base64.b64encode(zlib.compress(part, 9)).decode()
     scripts = {key: pack(text.encode()) for key, text in {**modules, name: read_web(f"{name}.js")}.items()}
     packed = {"start": name, "modules": scripts, "files": {key: pack(part) for key, part in files.items()}}
     carried = {"start": read_web("start.js"), "data": _page_json(data), "packed": _page_json(packed)}
-    return string.Template(read_web(f"{name}.html")).substitute(texts, **carried)
+    fill = lambda file, **more: string.Template(read_web(file)).substitute(texts, **more)
+    carried |= {"page": name, "body": fill(f"{name}.html"), "style": fill(f"{name}.css")}
+    nonce = hashlib.sha256(repr((texts, carried)).encode()).hexdigest()  # no name that the page shows can hold it
+    return fill("page.html", nonce=nonce, policy=POLICY.format(nonce) + policy, **carried)
 
 
 def _page_json(value) -> str:

@@ -10,7 +10,6 @@ kept in the cache; npm itself is not needed.
 
 import html
 import re
-import string
 import tarfile
 from pathlib import Path
 
@@ -20,7 +19,7 @@ import pooch
 
 from f3amd_companion.serving.foot_locking import leg_chains
 from f3amd_companion.serving.onnx_export import denoiser_program, model_card
-from f3amd_companion.serving.player import POLICY, describe_for_web, read_web, whole_page
+from f3amd_companion.serving.player import describe_for_web, read_web, whole_page
 from f3amd_lib.drawing.stick_figures import LIMB_COLORS, TARGET_COLOR, bones_of
 from f3amd_lib.ground.files import named_file, read_toml, write_whole
 from f3amd_lib.ground.names import check_known
@@ -83,10 +82,8 @@ def steer_page(
     offered = sorted(map(int, card["sigmas"]), reverse=True)
     steps = "".join(choice.format(number, " checked" * (number == num_steps)) for number in offered)
     credits = card["credit"], f"Terms: {card['terms']}", *map(package_credit, ("onnxruntime-web", "three"))
-    marks = "\n".join(f"b.{name} {{ color: {color}; }}" for name, color in _MARKS.items())
     count = sum(np.size(leaf) for leaf in jax.tree.leaves(trained.params))
     texts = {
-        "policy": f"{POLICY} 'wasm-unsafe-eval'; worker-src blob:",
         "title": html.escape(f"Steer {trained.name}"),
         "name": html.escape(trained.name),
         "home": f'<a href="{html.escape(home)}">Back</a>' if home else "",
@@ -99,7 +96,7 @@ def steer_page(
         "steps": steps,
         "feet": " checked" if legs else " disabled",
         "about_feet": _PAGE["feet_held" if legs else "feet_not_held"],
-        "style": string.Template(read_web("steer.css")).substitute(marks=marks),
+        "marks": "\n".join(f"b.{name} {{ color: {color}; }}" for name, color in _MARKS.items()),
     }
     core, three = (package_file("three", f"build/three.{part}.js").decode() for part in ("core", "module"))
     modules = {"core": core, "three": three.replace("./three.core.js", "core")}
@@ -107,7 +104,8 @@ def steer_page(
     script, wasm = RUNTIMES[runtime]
     files = {"worker": _worker(script).encode(), "wasm": package_file("onnxruntime-web", wasm), "program": program}
     files["poses"] = np.asarray(poses, np.float32).tobytes()
-    return whole_page("steer", texts, data, modules | {"body": read_web("body.js")}, files)
+    modules["body"] = read_web("body.js")
+    return whole_page("steer", texts, data, modules, files, policy=" 'wasm-unsafe-eval'; worker-src blob:")
 
 
 def write_steer(path, trained: TrainedModel, *, overwrite: bool = True, **options) -> Path:

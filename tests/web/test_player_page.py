@@ -18,6 +18,7 @@ from f3amd_lib.motion.skeleton import Skeleton, resample
 from f3amd_lib.motion.synthetic import synthesize
 
 FRAMES = 90
+MARKUP = "<img src=x onerror='window.ran = true'><script>window.ran = true</script>&amp;$title"
 TITLES = ["Real", "CAMDM, 8 steps", "F3AMD, 8 steps", "F3AMD, 1 step"]
 
 
@@ -451,8 +452,12 @@ def test_it_works_in_the_iframe_of_a_notebook(browser, walks, tmp_path):
     assert browser.errors() == [] and browser.requests() == []
 
 
-def test_the_page_forbids_itself_any_request(browser, alone):
-    opened(browser, alone)
+def test_the_page_forbids_itself_any_request_and_any_script_in_markup(browser, alone, tmp_path):
+    """As if a name had been written down as markup, after all."""
+    page, path = alone.read_text(encoding="utf-8"), tmp_path / "page.html"
+    path.write_text(page.replace("<header></header>", f"<header>{MARKUP}</header>"), encoding="utf-8")
+    opened(browser, path)
+    assert browser.script("return [document.images.length, window.ran]") == [1, None]
     assert browser.fetched("http://outside.invalid/") == "TypeError"
     assert any("Content Security Policy" in message for message in browser.errors())
     assert browser.outside() == []
@@ -634,9 +639,6 @@ def test_a_file_that_cannot_be_shown_is_refused_and_one_too_large_is_not_even_re
     drop(browser, "new Uint8Array(50e6 + 1)", "large.bvh")
     assert "51 MB" in notice(browser, "large.bvh") and "50 at most" in notice(browser, "large.bvh")
     assert browser.script("return [player.characters.length, window.wasRead]") == [1, None]
-
-
-MARKUP = "<img src=x onerror='window.ran = true'><script>window.ran = true</script>&amp;$title"
 
 
 def test_names_with_markup_are_text(browser, tmp_path):

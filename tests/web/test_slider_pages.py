@@ -5,16 +5,36 @@ import json
 import numpy as np
 import pytest
 from conftest import DESKTOP, PHONE
+from f3amd_notebooks.sliders import slide
 from test_sliders import NOTEBOOKS, sliders
+
+from f3amd_lib.drawing.style import new_figure
+
+MARKUP = "<img src=x onerror='window.ran=true'><script>window.ran=true</script>&amp;"
+# As strict as sliders allow: they move by an attribute of their own.
+HEAD = (
+    "<!doctype html><meta charset='utf-8'><meta name='viewport' content='width=device-width'>"
+    "<meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; style-src 'unsafe-inline'; "
+    "img-src data:; script-src-attr 'unsafe-inline'\">"
+)
 
 
 @pytest.fixture(params=NOTEBOOKS)
 def page(request, tmp_path):
     """A page with the committed sliders of one notebook."""
     path = tmp_path / f"{request.param}.html"
-    head = "<!doctype html><meta charset='utf-8'><meta name='viewport' content='width=device-width'>"
-    path.write_text(head + "<hr>".join(sliders(request.param)), encoding="utf-8")
+    path.write_text(HEAD + "<hr>".join(sliders(request.param)), encoding="utf-8")
     return path
+
+
+def test_words_with_markup_are_text(browser, tmp_path):
+    figure, axis = new_figure()
+    frames = {word: [np.zeros((2, 2))] for word in (MARKUP, MARKUP + "2")}
+    made = slide(figure, axis.plot([0, 1]), frames, label=MARKUP, alt=MARKUP)
+    (tmp_path / "page.html").write_text(HEAD + made.data, encoding="utf-8")
+    browser.open(tmp_path / "page.html").find("input").send_keys("\ue014")  # right
+    assert browser.find("output").text == MARKUP + "2" and MARKUP in browser.find("label").text
+    assert browser.script("return [document.images.length, window.ran]") == [1, None] and browser.errors() == []
 
 
 def drawn(browser, number: int) -> dict:

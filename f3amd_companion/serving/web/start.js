@@ -1,6 +1,6 @@
 // Unpacks what a page carries, tells the browser the modules' names and starts the page's own; `player.whole_page`.
 (async () => {
-  const script = document.getElementById("packed"), packed = JSON.parse(script.textContent);
+  const { nonce } = document.currentScript, script = document.getElementById("packed"), packed = JSON.parse(script.textContent);
   script.remove();
   const unpack = async (text) => {
     const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
@@ -11,8 +11,7 @@
     imports[name] = URL.createObjectURL(new Blob([await unpack(text)], { type: "text/javascript" }));
   for (const [name, text] of Object.entries(packed.files)) files[name] = new Uint8Array(await unpack(text));
   const map = document.createElement("script");
-  map.type = "importmap";
-  map.textContent = JSON.stringify({ imports });
+  Object.assign(map, { nonce, type: "importmap", textContent: JSON.stringify({ imports }) });
   document.head.append(map);
   const { start } = await import(packed.start);
   await start(files, unpack);
