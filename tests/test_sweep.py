@@ -30,6 +30,7 @@ from f3amd_lib.ground.profiles import load_profile, results_dir
 from f3amd_lib.ground.records import read_table, run_record
 from f3amd_lib.measures.protocol import Protocol
 from f3amd_lib.networks import presets
+from f3amd_lib.training import pipeline
 from f3amd_lib.training.checkpoints import load_model
 from f3amd_lib.training.pipeline import PreparedData
 
@@ -271,15 +272,21 @@ SNAPSHOTS = [(FIRST, 8), (FIRST, 16), (SECOND, 8)]
 
 
 def make_small(folder: Path, waits: bool, setattr=setattr) -> None:
-    """Narrow networks on few clips, here or in a worker; a quick measurement, which waits while a file says so."""
+    """Narrow networks on few clips, here or in a worker; measurements, which wait there while a file says so."""
     build, prepared = presets.build_config, PreparedData(tiny_packed(), WINDOW, HISTORY)
     judges = SimpleNamespace(params={"a": jnp.ones(1)}), Protocol(("calm", "proud")), None
 
-    def measure_model(generator, *arguments):
+    def begin(what):
         if waits:
-            (folder / f"at work {generator.trained.record['training']['seed']} {os.getpid()}").touch()
-            while (folder / "wait").exists():
-                time.sleep(0.05)
+            (folder / f"at work {what} {os.getpid()}").touch()
+        while waits and (folder / "wait").exists():
+            time.sleep(0.05)
+
+    def waiting(measure):
+        return lambda *arguments: (begin("there"), measure(*arguments))[1]
+
+    def measure_model(generator, *arguments):
+        begin(generator.trained.record["training"]["seed"])
         value = sum(float(jnp.abs(leaf).sum()) for leaf in jax.tree.leaves(generator.trained.params))
         rows = [{"steps": generator.num_steps, "metric": "weights", "unit": "m", "value": value / 3}]
         return pd.DataFrame(rows), None
@@ -288,11 +295,13 @@ def make_small(folder: Path, waits: bool, setattr=setattr) -> None:
     setattr(campaign, "measure_model", measure_model)
     setattr(sweep, "_opened", lambda profile, source: prepared)
     setattr(sweep, "protocol_of", lambda *a: judges)
+    setattr(sweep, "MEASUREMENTS", {name: waiting(measure) for name, measure in sweep.MEASUREMENTS.items()})
+    setattr(pipeline, "runs_dir", lambda *names: folder.joinpath("runs", *names))
 
 
 @pytest.fixture
 def small(tmp_path, monkeypatch) -> Path:
-    make_small(tmp_path, False, monkeypatch.setattr)
+    make_small(tmp_path / "alone", False, monkeypatch.setattr)
     return tmp_path
 
 
@@ -305,7 +314,7 @@ def start_worker(small):
             import pathlib, sys
             sys.path.insert(0, {str(Path(__file__).parent)!r})
             import test_sweep
-            test_sweep.make_small(pathlib.Path({str(small)!r}), True)
+            test_sweep.make_small(pathlib.Path({str(small / "swept")!r}), True)
         """)
     )
 
@@ -321,32 +330,52 @@ def start_worker(small):
         process.wait()
 
 
+KILLS = {
+    # What is swept, of which presets -> the tables, whose worker is killed, what is trained by then, all weights.
+    "snapshots": (
+        ["campaign"], [], ["campaign"], SECOND.seed, f"campaign/{SECOND.name}/*.state*",
+        "campaign/*/*[0-9].safetensors",
+    ),
+    "presets by measurements": (
+        ["noise_use", "gradient_norm"], [A, B], ["noise_use", "x0_by_sigma", "input_use", "gradient_norm"], "there",
+        "runs/*/*/models/*", "runs/*/*/models/*[0-9].safetensors",
+    ),
+}  # fmt: skip
+
+
 @pytest.mark.slow
 @pytest.mark.needs("distributed")
-def test_a_worker_killed_in_the_middle_costs_its_leg_and_no_byte(small, start_worker, monkeypatch):
+@pytest.mark.parametrize(("names", "models", "tables", "victim", "trained", "weights"), KILLS.values(), ids=KILLS)
+def test_a_worker_killed_in_the_middle_costs_its_leg_and_no_byte(
+    small, start_worker, monkeypatch, names, models, tables, victim, trained, weights
+):
     """One of two is killed between training and measuring; then the sweep is stopped, and started again."""
     from distributed import LocalCluster
 
-    alone = small / "alone"
+    alone, swept = small / "alone", small / "swept"
     monkeypatch.setenv("F3AMD_RESULTS_DIR", str(alone))
     settings = {"folder": alone / "campaign", "batch_size": 4, "snapshots": SNAPSHOTS, "progress": False}
-    list(run_campaign(sweep._opened(PROFILE, None), PROFILE, *sweep.protocol_of()[:2], **settings))
-    expected = contents(alone / "synthetic/smoke/records/campaign.csv")
+    for name in names:
+        if name == "campaign":
+            list(run_campaign(sweep._opened(PROFILE, None), PROFILE, *sweep.protocol_of()[:2], **settings))
+        else:
+            sweep.MEASUREMENTS[name](sweep._opened(PROFILE, None), PROFILE, models)
+    expected = {table: contents(alone / f"synthetic/smoke/records/{table}.csv") for table in tables}
 
-    work = Work(PROFILE, None, small / "results", small / "swept", batch_size=4)
-    legs, killed = plan(["campaign"], [], PROFILE, SNAPSHOTS), SECOND
-    (small / "wait").touch()
-    trained = []
+    work = Work(PROFILE, None, small / "results", swept, batch_size=4)
+    legs = plan(names, models, PROFILE, SNAPSHOTS)
+    swept.mkdir()
+    (swept / "wait").touch()
+    written = {}
 
     def kill_one():
         try:
-            until(lambda: len(list(small.glob("at work *"))) == 2)
-            (name,) = small.glob(f"at work {killed.seed} *")
-            (state,) = (work.folder / "campaign" / killed.name).glob("*.state.safetensors")
-            trained.extend([state, state.stat().st_mtime_ns])
+            until(lambda: len(list(swept.glob("at work *"))) == 2)
+            written.update({path: path.stat().st_mtime_ns for path in swept.glob(trained)})
+            name, *_ = swept.glob(f"at work {victim} *")
             os.kill(int(name.name.split()[-1]), signal.SIGKILL)
         finally:
-            (small / "wait").unlink()
+            (swept / "wait").unlink()
 
     with LocalCluster(n_workers=0, dashboard_address=None, silence_logs=logging.CRITICAL) as cluster:
         address = cluster.scheduler_address
@@ -356,19 +385,19 @@ def test_a_worker_killed_in_the_middle_costs_its_leg_and_no_byte(small, start_wo
         killer = threading.Thread(target=kill_one)
         killer.start()
         states = run_sweep(work, legs, scheduler=address)
-        first, told = next(states)
+        first, told = next((leg, told) for leg, told in states if leg.measurement in names)
         killer.join()
         assert told["state"] == "done" and [worker.poll() for worker in workers].count(None) == 1
         states.close()
-        gather(work, [first])
-        assert 0 < len(read_table(where(work, "campaign"))[0]) < len(expected[0].splitlines()) - 1
+        for path in gather(work, [first]):
+            assert 0 < len(contents(path)[0]) < len(expected[path.stem][0])
         again = {leg.name: told["state"] for leg, told in run_sweep(work, legs, scheduler=address)}
     gather(work, legs)
     assert again[first.name] == "done before" and set(again.values()) <= {"done", "done before"}
-    assert contents(where(work, "campaign")) == expected
-    for run, windows in SNAPSHOTS:
-        file = f"campaign/{run.name}/{windows}.safetensors"  # which tells its date, too
-        ours, theirs = (load_model(folder / file).params for folder in (work.folder, alone))
+    assert {table: contents(where(work, table)) for table in tables} == expected
+    for file in (files := list(alone.glob(weights))):  # which tells its date, too
+        theirs, ours = (load_model(path).params for path in (file, swept / file.relative_to(alone)))
         assert same_tree(ours, theirs), file
-    # The killed leg was not trained a second time.
-    assert trained[0].stat().st_mtime_ns == trained[1]
+    assert len(files) == len(SNAPSHOTS if not models else models)
+    # Nothing that was trained by then was trained a second time.
+    assert written and written == {path: path.stat().st_mtime_ns for path in written}
