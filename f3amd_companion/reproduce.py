@@ -15,11 +15,7 @@ import time
 from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
 
-import nbformat
 import pandas as pd
-import papermill
-from nbclient.exceptions import DeadKernelError
-from papermill.exceptions import PapermillExecutionError
 from tqdm import tqdm
 
 from f3amd_companion.speed.machine import describe_machine
@@ -30,6 +26,14 @@ from f3amd_lib.ground.files import locked
 from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.ground.profiles import load_profile, results_dir, runs_dir
 from f3amd_lib.ground.records import run_record, write_table
+
+try:
+    import nbformat
+    import papermill
+    from nbclient.exceptions import DeadKernelError
+    from papermill.exceptions import PapermillExecutionError
+except ModuleNotFoundError as error:
+    raise ImportError(f'notebooks need {error.name}: make install, or pip install "f3amd_lib[notebooks]"') from None
 
 KERNEL = "python3"
 

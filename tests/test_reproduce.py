@@ -2,6 +2,7 @@
 
 import json
 import os
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -259,3 +260,9 @@ def test_a_picture_of_one_name_and_bytes_stands_once(tmp_path):
     reproduce.keep_once([ours, theirs])
     gone = {theirs / "figures/02_paths.png", theirs / "media/05_feet.png"}
     assert {path for path in files if path.is_file()} == set(files) - gone
+
+
+def test_without_the_packages_that_run_notebooks_their_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "papermill", None)
+    with pytest.raises(ImportError, match=r"f3amd_lib\[notebooks\]"):
+        runpy.run_path(reproduce.__file__)
