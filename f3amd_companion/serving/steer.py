@@ -100,11 +100,10 @@ def steer_page(
     }
     core, three = (package_file("three", f"build/three.{part}.js").decode() for part in ("core", "module"))
     modules = {"core": core, "three": three.replace("./three.core.js", "core")}
-    modules |= {name: read_web(f"{name}.js") for name in ("motion", "network")}
+    modules |= {name: read_web(f"{name}.js") for name in ("body", "motion", "network")}
     script, wasm = RUNTIMES[runtime]
     files = {"worker": _worker(script).encode(), "wasm": package_file("onnxruntime-web", wasm), "program": program}
     files["poses"] = np.asarray(poses, np.float32).tobytes()
-    modules["body"] = read_web("body.js")
     return whole_page("steer", texts, data, modules, files, policy=" 'wasm-unsafe-eval'; worker-src blob:")
 
 
