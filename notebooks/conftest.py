@@ -1,23 +1,20 @@
 """How nbval runs notebooks: compiled quickly, and not as quickly where toys train in many steps."""
 
 import os
-import tempfile
 from importlib.metadata import version
 from pathlib import Path
 
 import pytest
+from jupyter_client.provisioning import local_provisioner
+
+from forked_kernels import Kernel
 
 # What one notebook or run compiled, the next ones read.
 ROOT = Path(__file__).resolve().parents[1]
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".pytest_cache" / "jax"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 
-# Tracing makes many small objects that are kept: kernels look for garbage as seldom as tests do.
-IPYTHON = tempfile.TemporaryDirectory()
-startup = Path(IPYTHON.name, "profile_default", "startup")
-startup.mkdir(parents=True)
-(startup / "garbage.py").write_text("import gc; gc.set_threshold(100_000, 20, 50)")
-os.environ["IPYTHONDIR"] = IPYTHON.name
+local_provisioner.launch_kernel = Kernel
 
 XLA_FLAGS = os.environ.get("XLA_FLAGS", "")
 QUICKLY = RUNNING = XLA_FLAGS  # see tests/conftest.py
