@@ -38,7 +38,6 @@ if "fusion_emitters" in os.environ.get("XLA_FLAGS", ""):  # the version of the l
     eager.move_by_numpy()
 
 REMEDY = {
-    "sphinx": "make site-tools",
     "selenium": "make web-tools",
     "distributed": "make sweep-tools",
     "jax2onnx": "make onnx-tools",
@@ -50,8 +49,8 @@ REMEDY = {
 
 
 def pytest_runtest_setup(item):
-    """Skip a test that asks for an optional package or program which is not there, by its name."""
-    for marker in item.iter_markers("needs"):
+    """Skip a test that asks for a package or program which is not there, by its name."""
+    for marker in (*item.iter_markers("needs"), *item.iter_markers("wants")):
         for name in marker.args:
             if shutil.which(name) is None and not _importable(name):
                 pytest.skip(f"{name} is not installed: {REMEDY.get(name, 'make bench-tools')}")

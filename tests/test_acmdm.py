@@ -8,33 +8,18 @@ from builders import draw, stirred
 from flax import nnx
 
 from f3amd_lib.networks import presets
-from f3amd_lib.text.networks.acmdm import (
-    ACMDM,
-    ACMDMConfig,
-    Control,
-    MaskedACMDM,
-    MaskedACMDMConfig,
-    TextCondition,
-    block_causal,
-    control_branch,
-    controlled,
-    draw_hidden,
-    rotary_angles,
-    rotary_base,
-    rotated,
-    spoil,
-)
+from f3amd_lib.text.networks import acmdm
 
 SIZE = {"num_joints": 5, "channels": 4, "window": 8, "latent_width": 16, "depth": 1, "num_heads": 2, "text_width": 6}
 BATCH = 2
 
 
-def config_of(family=ACMDMConfig, **settings):
+def config_of(family=acmdm.ACMDMConfig, **settings):
     return family(**{**SIZE, **settings})
 
 
 def fresh(config, seed=0):
-    family = MaskedACMDM if isinstance(config, MaskedACMDMConfig) else ACMDM
+    family = acmdm.MaskedACMDM if isinstance(config, acmdm.MaskedACMDMConfig) else acmdm.ACMDM
     return family(config, rngs=nnx.Rngs(seed))
 
 
@@ -50,7 +35,7 @@ def moved(array, *place):
 
 
 def condition(lengths=(8, 8), frames=8):
-    return TextCondition(normal(9, BATCH, 6), jnp.asarray(np.arange(frames) < np.array(lengths)[:, None]))
+    return acmdm.TextCondition(normal(9, BATCH, 6), jnp.asarray(np.arange(frames) < np.array(lengths)[:, None]))
 
 
 STATE = normal(1, BATCH, 8, 5, 4)
@@ -85,7 +70,7 @@ def test_parameters_are_those_of_the_released_sizes(size, million):
 
 @pytest.mark.parametrize(("tokens", "base"), [(49, 200), (98, 300), (539, 1400), (196, 500), (15, 100), (50, 200)])
 def test_rotary_bases_are_the_released_ones(tokens, base):
-    assert rotary_base(tokens) == base
+    assert acmdm.rotary_base(tokens) == base
 
 
 @pytest.mark.parametrize("patch", ["whole", "half", "pair"])
@@ -102,11 +87,13 @@ def test_patches_put_together_again_are_the_state(patch):
 def test_rotary_code_depends_on_distance_alone():
     query, key = normal(2, 1, 1, 1, 8), normal(3, 1, 1, 1, 8)
     product = lambda p, q: float(
-        jnp.vdot(rotated(query, rotary_angles([p], 4, 100)), rotated(key, rotary_angles([q], 4, 100)))
+        jnp.vdot(
+            acmdm.rotated(query, acmdm.rotary_angles([p], 4, 100)), acmdm.rotated(key, acmdm.rotary_angles([q], 4, 100))
+        )
     )
     assert product(3, 1) == pytest.approx(product(12, 10), abs=1e-5)
     assert abs(product(3, 1) - product(1, 3)) > 1e-2
-    angles = rotary_angles([1], 32, 200.0)
+    angles = acmdm.rotary_angles([1], 32, 200.0)
     np.testing.assert_allclose(angles[0, [0, -1]], [1.0, 1 / 200.0], rtol=1e-5)  # exponents 0 and 1, both
 
 
@@ -168,15 +155,6 @@ def test_text_and_time_reach_the_answer(network):
     assert np.abs(told.without_text().pooled).max() == 0.0
 
 
-def test_joints_that_fill_a_patch_up_are_no_joints():
-    """The sixth joint of three pairs: the weights that meet it, and what comes out there, do not matter."""
-    network = stirred(fresh(config_of(patch="pair")))
-    first = answer(network, STATE, TIME, condition())
-    other = stirred(fresh(config_of(patch="pair", num_joints=6)))
-    wide = jnp.pad(STATE, ((0, 0), (0, 0), (0, 1), (0, 0)))
-    np.testing.assert_allclose(answer(other, wide, TIME, condition())[:, :, :5], first, atol=2e-5)
-
-
 # ---------------------------------------------------------------------------------------------------------- blocks
 
 
@@ -186,9 +164,9 @@ def test_one_block_is_full_attention():
     np.testing.assert_allclose(
         answer(blocks, STATE, TIME, condition()), answer(full, STATE, TIME, condition()), atol=1e-6
     )
-    assert block_causal(8, 8, 8).all() and not block_causal(8, 8, 4).all()
-    np.testing.assert_array_equal(block_causal(4, 8, 4), np.ones((4, 8)))
-    np.testing.assert_array_equal(block_causal(2, 2, 1), [[1, 0], [1, 1]])
+    assert acmdm.block_causal(8, 8, 8).all() and not acmdm.block_causal(8, 8, 4).all()
+    np.testing.assert_array_equal(acmdm.block_causal(4, 8, 4), np.ones((4, 8)))
+    np.testing.assert_array_equal(acmdm.block_causal(2, 2, 1), [[1, 0], [1, 1]])
 
 
 def test_later_blocks_change_nothing_before_them():
@@ -203,31 +181,19 @@ def test_later_blocks_change_nothing_before_them():
     assert np.abs(earlier[:, 6] - first[:, 6]).max() > 1e-4
 
 
-@pytest.mark.slow
-def test_a_cache_stands_for_the_clean_blocks_before():
-    network, told = stirred(fresh(config_of(block_frames=4, patch="pair", depth=2))), condition((8, 6))
-    context = network.encode(told)
-    past = network.remember(STATE[:, :4], context._replace(mask=told.mask[:, :4]))
-    cached = network(STATE[:, 4:], TIME, context, past=past)
-    times = jnp.concatenate([jnp.ones((BATCH, 4)), jnp.repeat(TIME[:, None], 4, axis=1)], axis=1)
-    np.testing.assert_allclose(cached, answer(network, STATE, times, told)[:, 4:], atol=2e-5)
-    stale = answer(network, STATE, times.at[:, :4].set(0.5), told)[:, 4:]
-    assert np.abs(cached - stale).max() > 1e-3
-
-
 # ----------------------------------------------------------------------------------------------------- control branch
 
 
 @pytest.fixture(scope="module", params=["whole", "pair"])
 def control_pair(request):
     base = stirred(fresh(config_of(patch=request.param)))
-    return base, control_branch(base, 4, jax.random.key(5))
+    return base, acmdm.control_branch(base, 4, jax.random.key(5))
 
 
 def some_control(joint=2):
     asked = np.zeros((BATCH, 32, 5), np.float32)
     asked[:, 9, joint] = 1.0
-    return Control.of(normal(6, BATCH, 32, 5, 3), jnp.asarray(asked))
+    return acmdm.Control.of(normal(6, BATCH, 32, 5, 3), jnp.asarray(asked))
 
 
 def answer_with(*given):
@@ -236,7 +202,7 @@ def answer_with(*given):
 
 @nnx.jit
 def _answer_with(base, branch, condition, control):
-    return controlled(base, branch, condition, control)(STATE, TIME)
+    return acmdm.controlled(base, branch, condition, control)(STATE, TIME)
 
 
 def test_a_fresh_branch_changes_nothing_and_copies_the_blocks(control_pair):
@@ -278,7 +244,7 @@ def test_a_trained_branch_hears_control_in_its_place_and_time(control_pair):
 
 
 def test_a_masked_network_does_not_look_at_hidden_frames():
-    config = config_of(MaskedACMDMConfig)
+    config = config_of(acmdm.MaskedACMDMConfig)
     network, told = stirred(fresh(config)), condition((8, 6))
     hidden = np.tile(np.isin(np.arange(8), (3, 4)), (BATCH, 1))
 
@@ -303,11 +269,11 @@ def test_a_masked_network_does_not_look_at_hidden_frames():
 
 def test_hidden_frames_follow_the_cosine_and_stay_within_the_clip():
     mask = jnp.arange(40) < jnp.repeat(jnp.asarray([40, 10]), 2000)[:, None]
-    hidden = draw_hidden(jax.random.key(0), mask)
+    hidden = acmdm.draw_hidden(jax.random.key(0), mask)
     assert not bool((hidden & ~mask).any()) and int(hidden.sum(axis=1).min()) == 1
     share = np.asarray(hidden.sum(axis=1) / mask.sum(axis=1))[:2000]
     assert share.mean() == pytest.approx(2 / np.pi, abs=0.02) and share.max() == 1.0
-    spoilt, vector = spoil(jax.random.key(1), jnp.zeros((4000, 40, 1, 1)), hidden)
+    spoilt, vector = acmdm.spoil(jax.random.key(1), jnp.zeros((4000, 40, 1, 1)), hidden)
     replaced = spoilt[..., 0, 0] != 0.0
     assert not bool((replaced & ~hidden).any()) and not bool((vector & replaced).any())
     assert float(replaced.sum() / hidden.sum()) == pytest.approx(0.1, abs=0.01)
@@ -333,10 +299,10 @@ def test_every_preset_of_acmdm_survives_json_and_is_counted():
 @pytest.mark.parametrize(
     ("family", "settings", "message"),
     [
-        (ACMDMConfig, {"patch": "pairs"}, "did you mean 'pair'"),
-        (ACMDMConfig, {"latent_width": 18, "num_heads": 2}, "pairs of channels"),
-        (ACMDMConfig, {"block_frames": 4, "conditioning": "concatenation"}, "adaln"),
-        (MaskedACMDMConfig, {"block_frames": 4}, "masked autoregression"),
+        (acmdm.ACMDMConfig, {"patch": "pairs"}, "did you mean 'pair'"),
+        (acmdm.ACMDMConfig, {"latent_width": 18, "num_heads": 2}, "pairs of channels"),
+        (acmdm.ACMDMConfig, {"block_frames": 4, "conditioning": "concatenation"}, "adaln"),
+        (acmdm.MaskedACMDMConfig, {"block_frames": 4}, "masked autoregression"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(family, settings, message):

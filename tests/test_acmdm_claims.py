@@ -8,8 +8,6 @@ from test_claims import keep
 from f3amd_companion.ledger import claims
 from f3amd_companion.ledger.evidence import paper_evidence, recorded_evidence
 from f3amd_companion.ledger.judgements import FAILS, HOLDS, OPEN, REMARK, UNJUDGED, UNMEASURED
-from f3amd_lib.ground.papers import load_paper_file
-from f3amd_lib.papers.printed import check_model
 
 S, PAPER = "ACMDM-S-PS22", "acmdm"
 OTHERS = ("MARDM-v", "MARDM-eps", "MLD++", "MotionLCM V2", "ReMoDiffuse", "MotionDiffuse", "MDM-50Step")
@@ -113,16 +111,6 @@ def test_a_figure_by_itself_needs_motion_that_could_be_real_and_an_end(tmp_path,
     assert judged(tmp_path, tables)["C3"].ours[1].verdict == UNJUDGED
 
 
-def test_all_models_of_the_file_are_presets_or_named_as_others():
-    others = load_paper_file("paper", PAPER)["others"]
-    told = [row for claim in load_paper_file("claims", PAPER)["claim"] for statement in claim["statement"]
-            for row in (*statement.get("rows", ()), statement.get("among", {}), statement.get("row", {}))]  # fmt: skip
-    models = {row["model"] for row in told if "model" in row}
-    assert len(models) > 30
-    for model in models - set(others):
-        check_model(model, "claims.toml")
-
-
 def test_what_hangs_on_how_the_paper_counted_is_open(tmp_path):
     """Its evaluation divides by coordinates; only the pelvis, trained alone, is ahead by points as well."""
     c1, c2 = (claims.load_claims(PAPER)[name].judge(paper_evidence(PAPER)) for name in ("C1", "C2"))
@@ -131,12 +119,3 @@ def test_what_hangs_on_how_the_paper_counted_is_open(tmp_path):
     assert "0.0197 (0.0591 if by points) against 0.0404" in c1[1].figure
     ours = judged(tmp_path, world())  # records count points: there is nothing to ask
     assert ours["C2"].verdict == HOLDS and "by points" not in ours["C2"].ours[0].figure
-
-
-def test_the_papers_intervals_and_captions_arrive():
-    paper = paper_evidence(PAPER)
-    found = paper.figure("text_table1", model=f"{S}-raw", metric="text_FID")
-    assert (found.value, found.low, found.high) == pytest.approx((0.121, 0.115, 0.127))
-    row = {"model": S, "joint": "average", "metric": "control_average_error"}
-    assert paper.figure("text_table3", section="noise optimisation", **row).value == 0.0121
-    assert paper.figure("text_table3", section="trained on all joints", **row).value == 0.0197

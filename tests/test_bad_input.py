@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import zipfile
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from builders import SKELETON, refused, tiny_packed, tiny_trained, wandering_motion
+from builders import refused, tiny_packed, tiny_trained, wandering_motion
 
 from f3amd_companion.measuring.campaign import Run, queue
 from f3amd_companion.serving.artefact import read_manifest
 from f3amd_companion.serving.crowd import _open_rows
 from f3amd_lib.data import sources
-from f3amd_lib.data.packed import load_packed, pack, save_packed
+from f3amd_lib.data.packed import load_packed, save_packed
 from f3amd_lib.data.sources import open_dataset
 from f3amd_lib.ground.names import checked_seed
 from f3amd_lib.ground.profiles import load_profile
@@ -114,14 +113,6 @@ def test_a_member_without_a_name_is_no_file(tmp_path, name):
     assert [clip.name for clip in open_dataset("folder", path=path).clips] == known
 
 
-def test_a_single_file_is_no_data_set(tmp_path, monkeypatch):
-    file = tmp_path / "walk.bvh"
-    file.write_text(TEXT)
-    monkeypatch.setenv(sources.DATA_DIR_VARIABLE, str(file))
-    for name in ("folder", "bandai"):
-        refused("walk.bvh: is a single file; give its folder", open_dataset, name)
-
-
 # -------------------------------------------------------------------------------- caches and weights
 
 
@@ -138,18 +129,6 @@ def test_a_cache_with_flipped_bytes_is_refused_by_name(tmp_path):
             assert load_packed(path).num_clips == tiny_packed().num_clips
         except ValueError as error:
             assert str(path) in str(error)
-
-
-def test_half_precision_moves_no_joint_of_real_clips_by_half_a_millimetre(bandai_dataset):
-    """On every fiftieth clip; what the docstring of data/packed.py says."""
-    clips = bandai_dataset.clips[::50]
-    kept = pack(dataclasses.replace(bandai_dataset, clips=clips), progress=False)
-    motions = {clip.name: clip.load() for clip in clips if clip.name in kept.clip_names}
-    gaps = [
-        np.linalg.norm(kept.motion(number).positions - motions[name].positions, axis=-1).max()
-        for number, name in enumerate(kept.clip_names)
-    ]
-    assert 1e-4 < max(gaps) < 5e-4
 
 
 @pytest.mark.parametrize(
@@ -245,8 +224,3 @@ def test_camdms_orientation_error_sees_the_shoulders_as_its_code_does():
     measured = camdm_metrics(positions, path, skeleton)["camdm_orientation_error_deg"]
     assert measured == pytest.approx(np.rad2deg(0.4))
     assert camdm_orientation_error(np.zeros(20), path) == pytest.approx(0.0)
-
-
-def test_a_skeleton_without_collar_bones_faces_where_its_hips_do():
-    positions = wandering_motion(20).positions
-    np.testing.assert_array_equal(facing_yaw(SKELETON, positions), facing_yaw(SKELETON, positions, shoulders=True))

@@ -4,10 +4,8 @@ import jax
 import numpy as np
 import pytest
 from f3amd_notebooks import bimodal_paths as toy
-from f3amd_notebooks import one_step_ways as ways
 from f3amd_notebooks.bimodal_paths import BimodalPaths
 
-from f3amd_lib.diffusion import samplers
 from f3amd_lib.diffusion.schedules import variance_exploding, variance_preserving_cosine
 
 DATA = BimodalPaths()
@@ -73,19 +71,6 @@ def test_outcomes_are_counted_by_the_wall():
 # ------------------------------------------------------------------------------------- sampling
 
 
-@pytest.mark.parametrize("diffusion", [EXPLODING, PRESERVING], ids=["DDIM", "DDPM"])
-def test_paths_are_sampled_as_the_librarys_sampler_does(diffusion):
-    side, key = np.array([0, 0, 1, 2]), jax.random.key(3)
-    found = toy.sample_paths(SMALL, diffusion, 4, side, key)
-    key_init, key_steps = jax.random.split(key)
-    sigmas = diffusion.grid(4)
-    start = sigmas[0] * jax.random.normal(key_init, (4, 8, 2))
-    expected = samplers.sample(
-        diffusion.sampler, lambda x, sigma: SMALL.denoise(x, sigma, side), start, sigmas, key=key_steps
-    )
-    np.testing.assert_allclose(found, expected, atol=1e-4)
-
-
 def test_exact_one_step_hits_the_wall_eight_choose_and_a_given_side_needs_no_choice():
     for diffusion in (EXPLODING, PRESERVING):
         table = toy.outcome_table(DATA, diffusion, (1, 8), num_samples=400).set_index(["steps", "told"])
@@ -100,20 +85,3 @@ def test_exact_one_step_hits_the_wall_eight_choose_and_a_given_side_needs_no_cho
 
 
 # ------------------------------------------------------------------------------- ways in one step
-
-
-def test_real_paths_have_all_their_variety_and_a_mean_has_none():
-    paths, _ = SMALL.draw(jax.random.key(5), 2000)
-    real = ways.end_figures(SMALL, paths)
-    assert real["wall"] == 0.0 and real["variety"] == pytest.approx(1.0, abs=0.1)
-    means = np.repeat(SMALL.mean_paths, 10, axis=0)
-    assert ways.end_figures(SMALL, means)["variety"] == pytest.approx(0.0, abs=1e-9)
-    middle = np.repeat(SMALL.mean_paths.mean(axis=0)[None], 10, axis=0)
-    hit = ways.end_figures(SMALL, middle)
-    assert hit["wall"] == 1.0 and np.isnan(hit["variety"])
-
-
-def test_the_exact_mean_hits_the_wall_and_the_exact_walk_does_not():
-    compared = {"one": ([SMALL], 1), "eight": ([SMALL], 8)}
-    table = ways.ways_table(compared, EXPLODING, num_samples=200).set_index("way")
-    assert table.loc["one", "wall"] > 0.95 and table.loc["eight", "wall"] < 0.1

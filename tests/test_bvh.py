@@ -92,14 +92,9 @@ def test_each_joint_has_its_own_order_and_channels_may_be_mixed():
 @pytest.mark.parametrize(
     "change",
     [
-        pytest.param(lambda text: text.replace("\n", "\r\n"), id="CRLF"),
-        pytest.param(lambda text: text.replace("\n", "\r"), id="CR"),
         pytest.param(lambda text: text.replace(" ", "\t"), id="tabs"),
         pytest.param(lambda text: text.replace("Frames: ", "Frames:\t"), id="tab after Frames:"),
-        pytest.param(lambda text: text.replace("0 10 0", "0e0 1.0E+1 -0"), id="exponent in OFFSET"),
-        pytest.param(lambda text: text.replace("100 50 0", "+1.0e+2 5000E-2 -9.88446e-17"), id="exponents"),
         pytest.param(lambda text: text.replace("\n100", "\n\n 100").rstrip() + " \n\n", id="blanks"),
-        pytest.param(lambda text: text.rstrip("\n"), id="no last line end"),
         pytest.param(lambda text: text.lower().replace("base", "Base"), id="lower case"),
         pytest.param(lambda text: text.upper(), id="upper case"),
         pytest.param(lambda text: text.replace("\n{", " {").replace("\n  {", "{"), id="braces"),
@@ -113,10 +108,6 @@ def test_same_motion_however_it_is_typed(change):
     np.testing.assert_allclose(motion.positions, ARM_POSITIONS, atol=1e-12)
     assert motion.fps == pytest.approx(20.0)
     assert motion.skeleton.end_sites == ((2, (0.0, 0.05, 0.0)),)
-
-
-def test_joint_names_may_hold_blanks():
-    assert parse_bvh(ARM.replace("Elbow", "Left Fore Arm"), "a").skeleton.names[1] == "Left Fore Arm"
 
 
 SIX = "CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation"
@@ -186,19 +177,11 @@ def swap(old: str, new: str, count: int = 1):
 BROKEN = {
     "empty file": (lambda text: "", 1, "without a MOTION line"),
     "truncated last frame": (lambda text: text[:-9], 26, "frame 1 has 8 numbers .* 12 .* cut off"),
-    "row too long": (swap("50 0 0 0 0 0", "50 0 0 0 0 0 0"), 25, "frame 0 has 13 .* too long"),
-    "letter among numbers": (swap("90 0", "9O 0"), 26, "'9O' .number 4 of frame 1, Zrotation of B"),
-    "two numbers in one": (swap("100 50", "1.0.0 50"), 25, "'1.0.0' .number 1 of frame 0"),
     "NaN": (swap("-90", "nan"), 26, "'nan' .number 7 of frame 1, Zrotation of Elbow"),
-    "overflow": (swap("-90", "1e999"), 26, "'1e999'"),
     "too few frames": (swap("Frames: 2", "Frames: 3"), 23, "says 3, but 2 rows"),
     "no frame rows": (lambda text: text[: text.index("100 50")], 23, "says 2, but 0 rows"),
-    "zero frames": (swap("Frames: 2", "Frames: 0"), 23, "above 0, found '0'"),
-    "negative frame time": (swap("0.05", "-0.05"), 24, "positive .* '-0.05'"),
     "no Frames line": (swap("Frames: 2\n", ""), 22, "'Frames: 120' and .* must follow"),
-    "ends after MOTION": (lambda text: text[: text.index("Frames")], 22, "found 'the end of the file'"),
     "two ROOTs": (swap("}\n\nMOTION", "}\nROOT Twin\n{\n}\nMOTION"), 21, "second ROOT .*'Base' in l"),
-    "missing brace": (swap("}\n\nMOTION", "\n\nMOTION"), 22, "'{' of 'Base' .line 2. is still"),
     "brace too many": (swap("}\n\nMOTION", "}\n}\nMOTION"), 21, "'}' is outside"),
     "joint without brace": (swap("Elbow\n  {", "Elbow\n"), 6, "JOINT needs a name .* '{', found 'Elbow"),
     "unknown channel": (
@@ -206,20 +189,14 @@ BROKEN = {
         5,
         "'Base' says it has 6 channels, but lists X.* Zrotation; each",
     ),
-    "too few channels": (swap("CHANNELS 3", "CHANNELS 4"), 9, "'Elbow' says it has 4 channels, but lists Z"),
     "channel twice": (swap("Yrotation\n  J", "Xrotation\n  J"), 5, "has 6 .* Xrotation, Xrotation; .* once"),
-    "channel count missing": (swap("CHANNELS 3", "CHANNELS"), 9, "CHANNELS needs a count"),
     "duplicate names": (swap("JOINT Wrist", "JOINT Elbow"), 10, "'Elbow' is taken .line 6"),
     "joint without name": (swap("JOINT Wrist", "JOINT"), 10, "needs a name"),
     "joint without OFFSET": (swap("    OFFSET 0 10 0\n", ""), 18, "'Elbow' ends without OFFSET"),
-    "second OFFSET": (swap("OFFSET 0 10 0", "OFFSET 0 10 0 OFFSET 0 1 0"), 8, "second OFFSET"),
     "short OFFSET": (swap("OFFSET 0 10 0", "OFFSET 0 10"), 8, "OFFSET needs 3 .* CHANNELS'"),
-    "NaN in OFFSET": (swap("OFFSET 0 10 0", "OFFSET 0 nan 0"), 8, "OFFSET needs 3 finite .* '0 nan 0'"),
     "no MOTION": (swap("MOTION", "MOTIONS"), 27, "without a MOTION line"),
     "cut inside the hierarchy": (lambda text: text[:120], 6, "without a MOTION line"),
     "no HIERARCHY": (swap("HIERARCHY", "HELLO"), 1, "unexpected 'HELLO'; known here are HIERARCHY"),
-    "no ROOT": (lambda text: "HIERARCHY\n" + text[text.index("MOTION") :], 2, "a ROOT needs CHANNELS"),
-    "stray word": (swap("OFFSET 0 10 0", "OFFSETS 0 10 0"), 8, "unexpected 'OFFSETS'"),
     "odd bytes in a row": (lambda text: text.encode().replace(b"-90", b"\xff\xfe"), 26, "number 7"),
     "UTF-16": (lambda text: text.encode("utf-16"), 1, "as UTF-8"),
 }

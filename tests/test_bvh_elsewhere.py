@@ -6,8 +6,7 @@ import pytest
 from builders import SKELETON, wandering_motion
 
 from f3amd_lib.motion.bvh import write_bvh
-from f3amd_lib.motion.rotations import matrix_from_yaw
-from f3amd_lib.motion.skeleton import Motion, forward_kinematics, turn
+from f3amd_lib.motion.skeleton import forward_kinematics, turn
 from f3amd_lib.motion.synthetic import synthesize
 
 
@@ -71,18 +70,6 @@ def test_up_and_forward_are_the_axes_that_other_programs_find(tmp_path, walk):
         facing = np.deg2rad(degrees) - walk.yaw[0]
         bvh = opened(tmp_path / axis, turn(walk, facing))
         assert str(bvh.forward_at(0)) == axis
-
-
-def test_a_turned_character_is_turned_for_others_as_well(tmp_path):
-    root = np.zeros((4, 3)) + [0.0, 0.9, 0.0]
-    yaw = np.deg2rad([0.0, 90.0, 180.0, -90.0])
-    turns = np.broadcast_to(np.eye(3), (4, SKELETON.num_joints, 3, 3)).copy()
-    turns[:, 0] = matrix_from_yaw(yaw)
-    seen = metres_by_name(opened(tmp_path, Motion(SKELETON, root, turns)))
-    # Facing +Z the left hip lies at +X; a quarter turn to the left takes it to -Z.
-    left = seen["LeftUpLeg"] - root - [0.0, -0.05, 0.0]
-    expected = 0.1 * np.array([[1, 0, 0], [0, 0, -1], [-1, 0, 0], [0, 0, 1]])
-    np.testing.assert_allclose(left, expected, atol=1e-6)
 
 
 def test_tips_come_along(tmp_path):

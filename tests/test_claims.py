@@ -11,7 +11,6 @@ from f3amd_companion.ledger import claims, theory
 from f3amd_companion.ledger.evidence import (
     OF_TRAINED_NETWORKS,
     Figure,
-    NotMeasured,
     mean_figure,
     paper_evidence,
     power_law,
@@ -39,11 +38,10 @@ from f3amd_companion.ledger.judgements import (
     stated_factor,
     within,
 )
-from f3amd_companion.speed.timing import median_interval
 from f3amd_lib.ground.records import read_table, write_table
 from f3amd_lib.networks.attention import TransformerBlock
 from f3amd_lib.networks.spectral import FNOBlock
-from f3amd_lib.papers.printed import NINE_METRICS, OF_TEXT, REFERENCE_ROWS, checked_table
+from f3amd_lib.papers.printed import NINE_METRICS, OF_TEXT, REFERENCE_ROWS
 
 # --------------------------------------------------------------------------------- made-up records
 
@@ -418,34 +416,6 @@ def test_each_computed_rule_passes_its_oracle_and_fails_its_nonsense(tmp_path, m
     assert judgement.verdict == wanted, judgement.ours
 
 
-def apart(model, *, kept=("EMD",), **settings):
-    """Rows of a model that is 1,000 times worse in all metrics but some."""
-    return quality(model, harm=1000.0, **{metric: BASE[metric] for metric in kept}, **settings)
-
-
-# Claim -> tables that one metric, or one figure, of many would have saved.
-ONE_OF_MANY = [
-    ("Q4", {"quality": quality(FNO) + quality(CAMDM) + apart(FNO, window=64) + quality(CAMDM, window=64)}),
-    ("Q5", {"quality": sum((apart(FNO, steps=n, kept=("EMD", "diversity")) for n in (4, 2, 1)), quality(FNO))}),
-    (
-        "Q5",
-        {"quality": sum((quality(FNO, steps=n, diversity=0.1) for n in (8, 4, 2, 1)), [])},
-    ),  # one motion for all noise
-    ("Q9", {"quality": sum(map(apart, MODES), quality(FNO) + quality(f"{FNO}-m1", harm=0.5, EMD=40.0))}),
-    ("Q10", {"quality": sum(map(apart, OTHER_FNO), quality(FNO))}),
-    ("Q11", {"quality": sum(map(apart, KINDS), quality(FNO))}),
-    ("Q16", {"quality_by_round": rounds(-0.2, gap_m=0.8), "quality": quality(FNO)}),
-    ("E4", {"synthesis_time": small_against_many(3.0, 2.0, lambda count: 100.0 / (2.5 if count == 1 else 1.5))}),
-    ("E14", {"synthesis_time": two_kinds(5.0, lambda count: 5.0 if count == 1 else 8.0)}),
-]
-
-
-@pytest.mark.parametrize(("claim_id", "tables"), ONE_OF_MANY)
-def test_one_of_many_figures_saves_nothing(tmp_path, claim_id, tables):
-    judgement = judge(keep(tmp_path, tables), claim_id)
-    assert judgement.verdict == FAILS, judgement.ours
-
-
 def test_each_rule_says_why_nothing_was_measured(tmp_path):
     for claim_id in RECORDED:
         judgement = judge(tmp_path, claim_id)
@@ -622,11 +592,6 @@ def test_converged_means_that_twice_the_length_changes_little():
     assert not converged({}, {})
 
 
-def test_times_and_a_papers_own_tables_need_no_training(tmp_path):
-    assert claims.load_claims()["Q12"].judge(paper_evidence())[0].verdict == HOLDS
-    assert judge(keep(tmp_path / "time", {"synthesis_time": TIMES["E2"][0]}), "E2").verdict == HOLDS
-
-
 def snapshots(root, rows, claim_id="Q10"):
     """Write rows (model, windows, recipe, seed, classifier, worth) of the long queue, all nine metrics of each; judge.
 
@@ -669,41 +634,7 @@ def test_networks_that_the_queue_trained_alike_are_shown_and_decide_nothing(tmp_
     assert "at 800,000 windows" in str(snapshots(tmp_path / "twice", [*alike, *longer]).ours[0].sources[0])
 
 
-def test_snapshots_of_the_queue_are_learning_curves(tmp_path):
-    """E13 asks in which epoch a network comes close to its best."""
-
-    def curve(model, worths, recipe="paper"):
-        """What the classifier sees stays; the other metrics are better when they are lower."""
-        lengths = zip((100_000, 200_000, 400_000, 800_000), worths, strict=True)
-        return [(model, length, recipe, 0, "one", (1.0, worth)) for length, worth in lengths]
-
-    soon, late, falling = (9.0, 1.0, 1.0, 1.0), (9.0, 5.0, 1.0, 1.0), (9.0, 5.0, 3.0, 1.0)
-    judged = lambda name, *curves: snapshots(tmp_path / name, sum(curves, []), "E13")
-    fast, slow = curve(FNO, soon), curve(CAMDM, late)
-    holds = judged("holds", fast, slow)
-    assert holds.verdict == HOLDS and "foot_sliding 2 against 4" in holds.ours[0].figure
-    assert judged("fails", curve(FNO, late), curve(CAMDM, soon)).verdict == FAILS
-    unfinished = judged("falling", fast, curve(CAMDM, falling))
-    assert unfinished.verdict == UNMEASURED and "still getting better at the last epoch, 8" in unfinished.ours[0].figure
-    # Another recipe or a single length is no curve beside this one.
-    for name, other in {"recipe": curve(CAMDM, late, recipe="wide-decoder"), "single": slow[:1]}.items():
-        assert "quality_by_epoch.csv has no " in judged(name, fast, other).ours[0].figure, name
-
-
 # ---------------------------------------------------------------------------- intervals of times
-
-
-def test_the_interval_of_a_median_is_not_the_spread_of_its_rounds():
-    """Both forms: the bootstrap of new records, and what older ones have, which comes close to it."""
-    rounds = np.random.default_rng(1).lognormal(4.0, 0.3, 100)
-    value, low, high = np.quantile(rounds, (0.5, 0.05, 0.95))
-    bootstrap = median_interval(rounds)
-    row = times("CPU", (1,), (FNO, value))[0] | {"low": low, "high": high, "rounds": 100}
-    found = checked_table("synthesis_time", pd.DataFrame([row]), "t.csv").iloc[0]
-    assert low < found["low"] < value < found["high"] < high
-    assert 0.6 < (found["high"] - found["low"]) / np.ptp(bootstrap) < 1.7
-    told = row | {"median_low": bootstrap[0], "median_high": bootstrap[1]}
-    assert checked_table("synthesis_time", pd.DataFrame([told]), "t.csv").iloc[0]["low"] == bootstrap[0]
 
 
 # ------------------------------------------------------------------------------- other convictions
@@ -758,20 +689,11 @@ FILE = {
     "thresholds": {"minor": 1.3},
     "families": {"FNO": {"models": [FNO, "F3AMD-FNO-64"], "required": [FNO]}},
 }
-SPREAD = {"says": "alike", "kind": "metric_spread", "metric": "FID", "within": [0, "minor"]}
 
 
 def read(*statements, ids=("Q1",)):
     entry = {"text": "worse", "where": "1", "decided_by": "FID", "statement": list(statements)}
     return claims.read_claims(FILE | {"claim": [{"id": name, **entry} for name in ids]}, "f3amd", "f.toml")
-
-
-def test_a_statement_names_its_kind_models_and_range():
-    claim = read(STATEMENT | {"about": [5, 2]}, SPREAD | {"models": {"family": "FNO", "window": 64}})["Q1"]
-    first, second = (statement.rule.keywords for statement in claim.statements)
-    wide = {"model": FNO, "window_frames": 64, "steps": 8}
-    assert first["model"] == wide | {"window_frames": 32} and first["bounds"] == pytest.approx((2.25, 2.75))
-    assert second["bounds"] == (0, 1.3) and second["models"]["required"] == [wide]
 
 
 @pytest.mark.parametrize(
@@ -793,19 +715,6 @@ def test_a_broken_statement_is_an_error(statement, message):
 
 
 # ----------------------------------------------------------------------- the paper's own tables
-
-
-def test_the_paper_is_read_like_our_records():
-    found = lambda name, **row: paper_evidence().figure(name, **row).value
-    time = lambda model, device, count, framework: found(
-        "synthesis_time", model=model, window_frames=32, steps=8, framework=framework, device=device, characters=count
-    )
-    assert time(CAMDM, "GPU", 16, "iree") == 8.95 and time(CAMDM, "CPU", 1, "torch") == 34.58
-    assert time(f"{FNO}-concatenation", "GPU", 1024, "iree") == 183.39
-    assert found("quality", model=f"{FNO}-m14", metric="IRD") == 3.131
-    assert found("training_time", model=FNO, window_frames=64, batch_size=512, device="GPU") == 6.48
-    with pytest.raises(NotMeasured, match="the paper prints no CAMDM, 64 frames, 8 steps, FID"):
-        found("quality", model=CAMDM, window_frames=64, steps=8, metric="FID")
 
 
 # ---------------------------------------------------------------------------- the ledger itself

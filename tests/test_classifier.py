@@ -11,23 +11,6 @@ from test_skeleton import BANDAI
 
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.measures import classifier as module
-from f3amd_lib.measures.classifier import (
-    ACCURACY_BAR,
-    CLASSIFIER_JOINTS,
-    NUM_CHANNELS,
-    ClassifierConfig,
-    ClassifierTraining,
-    StyleNetwork,
-    StyleTask,
-    classifier_frames,
-    load_classifier,
-    mirror_channels,
-    obtain_classifier,
-    require_telling_styles,
-    save_classifier,
-    side_by_side,
-    train_classifier,
-)
 from f3amd_lib.motion.rotations import matrix_from_yaw
 from f3amd_lib.motion.skeleton import Motion, Skeleton, mirror
 from f3amd_lib.motion.synthetic import SYNTHETIC_SKELETON, synthesize
@@ -35,7 +18,7 @@ from f3amd_lib.motion.synthetic import SYNTHETIC_SKELETON, synthesize
 STYLES = ("ArmsOverhead", "Runner", "Zombie")
 WINDOW = 20
 SIZES = {"window": WINDOW, "widths": (8, 12), "hidden_width": 24, "feature_width": 16}
-CONFIG = ClassifierConfig(num_styles=3, **SIZES)
+CONFIG = module.ClassifierConfig(num_styles=3, **SIZES)
 TRAINING = {"num_steps": 80, "batch_size": 32, "progress": False, **SIZES}
 BRIEF = {**TRAINING, "num_steps": 3}
 
@@ -60,13 +43,13 @@ def packed():
 
 @pytest.fixture(scope="module")
 def trained(packed):
-    return train_classifier(packed, **TRAINING)
+    return module.train_classifier(packed, **TRAINING)
 
 
 @pytest.fixture(scope="module")
 def saved(trained, tmp_path_factory):
     path = tmp_path_factory.mktemp("classifier") / "classifier.safetensors"
-    save_classifier(path, trained)
+    module.save_classifier(path, trained)
     return path
 
 
@@ -78,12 +61,12 @@ def walk(seed=7, style="Zombie", seconds=3.0) -> Motion:
 
 
 def test_fifteen_joints_are_seen_of_whichever_rig_and_all_are_needed():
-    assert len(CLASSIFIER_JOINTS) == 15 and NUM_CHANNELS == 45
-    assert not [joint for joint in CLASSIFIER_JOINTS if "wrist" in joint or "toe" in joint]
-    shown = [classifier_frames(rig.rest_positions[None], rig) for rig in (BANDAI, SYNTHETIC_SKELETON)]
-    assert [frames.shape for frames in shown] == [(1, NUM_CHANNELS)] * 2
+    assert len(module.CLASSIFIER_JOINTS) == 15 and module.NUM_CHANNELS == 45
+    assert not [joint for joint in module.CLASSIFIER_JOINTS if "wrist" in joint or "toe" in joint]
+    shown = [module.classifier_frames(rig.rest_positions[None], rig) for rig in (BANDAI, SYNTHETIC_SKELETON)]
+    assert [frames.shape for frames in shown] == [(1, module.NUM_CHANNELS)] * 2
     less = Skeleton(["toy"] + [f"bone {n}" for n in range(20)], BANDAI.parents, np.zeros((21, 3)))
-    refused("no joint has the role", classifier_frames, np.zeros((1, 21, 3)), less)
+    refused("no joint has the role", module.classifier_frames, np.zeros((1, 21, 3)), less)
 
 
 def figure(hips_yaw=0.0, collar_yaw=0.0) -> np.ndarray:
@@ -99,8 +82,8 @@ def figure(hips_yaw=0.0, collar_yaw=0.0) -> np.ndarray:
 
 def seen(frame: np.ndarray) -> dict:
     """What the classifier sees of one frame, [x, y, z] by joint."""
-    numbers = classifier_frames(frame, BANDAI).reshape(-1, 3)
-    return dict(zip(CLASSIFIER_JOINTS, numbers, strict=True))
+    numbers = module.classifier_frames(frame, BANDAI).reshape(-1, 3)
+    return dict(zip(module.CLASSIFIER_JOINTS, numbers, strict=True))
 
 
 def test_a_frame_is_moved_to_its_hips_and_turned_to_face_z():
@@ -116,39 +99,43 @@ def test_place_and_direction_of_each_frame_are_not_seen():
     rng = np.random.default_rng(0)
     turn = matrix_from_yaw(rng.uniform(-3, 3, motion.num_frames))
     moved = motion.positions @ np.swapaxes(turn, -1, -2) + rng.normal(size=(motion.num_frames, 1, 3))
-    expected = classifier_frames(motion.positions, SYNTHETIC_SKELETON)
-    np.testing.assert_allclose(classifier_frames(moved, SYNTHETIC_SKELETON), expected, atol=1e-12)
+    expected = module.classifier_frames(motion.positions, SYNTHETIC_SKELETON)
+    np.testing.assert_allclose(module.classifier_frames(moved, SYNTHETIC_SKELETON), expected, atol=1e-12)
     assert expected.std(axis=0).max() > 0.02  # something is seen
     np.testing.assert_array_equal(expected[:, :3], 0.0)
 
 
 def test_mirrored_channels_show_the_mirrored_motion():
     motion = walk(style="LimpLeft")
-    channel, sign = mirror_channels()
-    shown = sign * classifier_frames(motion.positions, SYNTHETIC_SKELETON)[:, channel]
-    mirrored = classifier_frames(mirror(motion).positions, SYNTHETIC_SKELETON)
+    channel, sign = module.mirror_channels()
+    shown = sign * module.classifier_frames(motion.positions, SYNTHETIC_SKELETON)[:, channel]
+    mirrored = module.classifier_frames(mirror(motion).positions, SYNTHETIC_SKELETON)
     np.testing.assert_allclose(shown, mirrored, atol=1e-6)
-    assert np.abs(shown - classifier_frames(motion.positions, SYNTHETIC_SKELETON)).max() > 0.05
+    assert np.abs(shown - module.classifier_frames(motion.positions, SYNTHETIC_SKELETON)).max() > 0.05
 
 
 def test_motion_that_is_shorter_than_a_window_or_not_finite_gives_none():
     positions = np.array(walk(seconds=59 / 30).positions)
-    assert side_by_side(classifier_frames(positions, SYNTHETIC_SKELETON), 60).shape == (0, 60, NUM_CHANNELS)
+    assert module.side_by_side(module.classifier_frames(positions, SYNTHETIC_SKELETON), 60).shape == (
+        0,
+        60,
+        module.NUM_CHANNELS,
+    )
     positions[40, 3, 1] = np.nan
-    refused("not finite at frame 40, joint 3$", classifier_frames, positions, SYNTHETIC_SKELETON)
-    refused(r"positions must be \[\.\.\., 23, 3\]", classifier_frames, np.zeros((60, 24, 3)), SYNTHETIC_SKELETON)
+    refused("not finite at frame 40, joint 3$", module.classifier_frames, positions, SYNTHETIC_SKELETON)
+    refused(r"positions must be \[\.\.\., 23, 3\]", module.classifier_frames, np.zeros((60, 24, 3)), SYNTHETIC_SKELETON)
 
 
 # ------------------------------------------------------------------------------------- network
 
 
 def test_default_network_has_the_published_number_of_weights():
-    _, params, statistics = module._blank(ClassifierConfig(num_styles=100))
+    _, params, statistics = module._blank(module.ClassifierConfig(num_styles=100))
     assert sum(leaf.size for leaf in jax.tree.leaves(params)) == 8_489_572
     assert sum(leaf.size for leaf in jax.tree.leaves(statistics)) == 2 * (64 + 128 + 1024 + 512)
 
 
-def numpy_forward(network: StyleNetwork, windows: np.ndarray):
+def numpy_forward(network: module.StyleNetwork, windows: np.ndarray):
     """The network written out in loops over frames, float64."""
 
     def number(param):
@@ -183,7 +170,7 @@ def test_network_equals_its_layers_written_out(trained):
     statistics = jax.tree.map(
         lambda leaf: jnp.asarray(rng.uniform(0.05, 0.5, leaf.shape), jnp.float32), trained.statistics
     )
-    windows = rng.normal(size=(4, WINDOW, NUM_CHANNELS)).astype(np.float32)
+    windows = rng.normal(size=(4, WINDOW, module.NUM_CHANNELS)).astype(np.float32)
     features, scores = module._answers(CONFIG, trained.params, statistics, windows)
     network = module._network(CONFIG, trained.params, statistics)
     expected_features, expected_scores = numpy_forward(network, windows)
@@ -203,11 +190,11 @@ def test_a_short_training_tells_three_styles_apart_on_unseen_clips(trained):
     for number, style in enumerate(STYLES):
         windows = trained.windows_of(walk(9, style, 10.0).positions, SYNTHETIC_SKELETON)
         assert np.mean(trained.features_and_classes(windows)[1] == number) > 0.8
-    require_telling_styles(trained)
+    module.require_telling_styles(trained)
 
 
 def test_held_out_accuracy_is_the_share_of_right_answers_on_held_out_clips(packed):
-    weak = train_classifier(packed, **BRIEF)
+    weak = module.train_classifier(packed, **BRIEF)
     shares = {}
     for number, style in enumerate(STYLES):
         right = []
@@ -221,12 +208,12 @@ def test_held_out_accuracy_is_the_share_of_right_answers_on_held_out_clips(packe
 
 
 def test_every_style_is_drawn_alike_and_mirrored_where_it_may_be():
-    frames = np.zeros((40, NUM_CHANNELS), np.float32)
+    frames = np.zeros((40, module.NUM_CHANNELS), np.float32)
     frames[:, 3] = 1.0  # x of the neck
     frames[30:, 0] = 1.0  # tells the second style
-    task = StyleTask(
-        ClassifierConfig(2, window=10),
-        ClassifierTraining(1, 2000, 0),
+    task = module.StyleTask(
+        module.ClassifierConfig(2, window=10),
+        module.ClassifierTraining(1, 2000, 0),
         frames=jnp.asarray(frames),
         starts=jnp.asarray([0, 5, 10, 15, 30]),
         first=jnp.asarray([0, 4]),
@@ -242,23 +229,17 @@ def test_every_style_is_drawn_alike_and_mirrored_where_it_may_be():
     np.testing.assert_array_equal(np.asarray(windows)[second, :, 3], 1.0)
 
 
-def test_references_tell_style_and_clip_of_each_window(trained):
-    known = trained.references["held_out"]
-    assert known.styles.tolist() == [0] * 8 + [1] * 8 + [2] * 8
-    assert known.clips.tolist() == np.repeat([2, 3, 6, 7, 10, 11], 4).tolist()
-
-
 # ------------------------------------------------------------------------------------ refusals
 
 
 def test_a_classifier_that_guesses_is_refused_with_accuracy_and_bar(trained):
     shares = dict(zip(STYLES, (0.5, 1.0, 0.7), strict=True))
     weak = dataclasses.replace(trained, held_out_accuracy=shares)
-    refused(r"73\.3 %.*bar of 80\.0 %.*worst: ArmsOverhead 50 %", require_telling_styles, weak)
-    at_the_bar = dataclasses.replace(trained, held_out_accuracy={"one": ACCURACY_BAR})
-    require_telling_styles(at_the_bar)
+    refused(r"73\.3 %.*bar of 80\.0 %.*worst: ArmsOverhead 50 %", module.require_telling_styles, weak)
+    at_the_bar = dataclasses.replace(trained, held_out_accuracy={"one": module.ACCURACY_BAR})
+    module.require_telling_styles(at_the_bar)
     unknown = dataclasses.replace(trained, held_out_accuracy={"one": float("nan")})
-    refused("nan %", require_telling_styles, unknown)
+    refused("nan %", module.require_telling_styles, unknown)
 
 
 def test_motion_of_another_body_is_refused(trained):
@@ -272,7 +253,7 @@ def test_motion_of_another_body_is_refused(trained):
 
 
 def test_classifier_comes_back_exactly(trained, saved):
-    loaded = load_classifier(saved)
+    loaded = module.load_classifier(saved)
     windows = trained.windows_of(walk(seed=9).positions, SYNTHETIC_SKELETON)
     assert same_tree(loaded.features_and_classes(windows), trained.features_and_classes(windows))
     for field in ("config", "styles", "held_out_accuracy", "record", "skeleton"):
@@ -283,7 +264,7 @@ def test_classifier_comes_back_exactly(trained, saved):
 def test_classifier_is_trained_once_for_each_data_and_recipe(packed, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "runs_dir", lambda dataset, profile: tmp_path / dataset / profile)
     profile = load_profile("smoke", "synthetic")
-    first, origin = obtain_classifier(packed, profile, **BRIEF)
+    first, origin = module.obtain_classifier(packed, profile, **BRIEF)
     assert origin == "trained now" and first.record["dataset_fingerprint"] == packed.fingerprint
     asked = []
 
@@ -292,7 +273,7 @@ def test_classifier_is_trained_once_for_each_data_and_recipe(packed, tmp_path, m
         return first
 
     monkeypatch.setattr(module, "train_classifier", train_again)
-    again, origin = obtain_classifier(packed, profile, **BRIEF)
+    again, origin = module.obtain_classifier(packed, profile, **BRIEF)
     assert origin == "earlier run" and not asked
     assert same_tree(again.params, first.params)
     others = (
@@ -302,6 +283,6 @@ def test_classifier_is_trained_once_for_each_data_and_recipe(packed, tmp_path, m
         (packed, {**BRIEF, "hidden_width": 25}),
     )
     for data, settings in others:
-        assert obtain_classifier(data, profile, **settings)[1] == "trained now"
+        assert module.obtain_classifier(data, profile, **settings)[1] == "trained now"
         assert settings.items() <= asked[-1].items()
     assert len(list(tmp_path.rglob("synthetic/smoke/classifier/*.safetensors"))) == 5

@@ -20,7 +20,7 @@ from f3amd_companion.__main__ import COMMANDS, main
 from f3amd_companion.measuring import times as measurements
 from f3amd_companion.serving import motion_files
 from f3amd_companion.serving.crowd import read_crowd
-from f3amd_companion.serving.crowd_planning import MIN_DISTANCE, closest_approach
+from f3amd_companion.serving.crowd_planning import closest_approach
 from f3amd_companion.speed import machine, speed_tables
 from f3amd_companion.terminal import Lines
 from f3amd_lib.motion.bvh import read_bvh
@@ -105,22 +105,6 @@ def test_a_planned_crowd_keeps_apart_and_is_drawn_beside_its_folder(weights, tmp
     assert (tmp_path / "crowd.png").stat().st_size > 5000
 
 
-def test_pictures_of_another_crowd_are_not_written_over(weights, tmp_path, capsys):
-    out = tmp_path / "crowd"
-    words = ["crowd", "--weights", weights, "--out", str(out), "--steps", "1", "--characters", "2"]
-    words += ["--seconds", "0.2", "--pictures"]
-    for name in ("crowd.html", "crowd.png"):
-        (tmp_path / name).write_text("of another crowd")
-        assert main(words) == 2
-        assert f"{tmp_path / name}: exists already; pass --overwrite" in capsys.readouterr().err
-        assert (tmp_path / name).read_text() == "of another crowd"
-        assert not out.exists()  # nothing was generated for nothing
-        (tmp_path / name).unlink()
-    (tmp_path / "crowd.html").write_text("of another crowd")
-    assert main([*words, "--overwrite"]) == 0
-    assert "player-data" in (tmp_path / "crowd.html").read_text(encoding="utf-8")
-
-
 def test_a_crowd_that_was_stopped_while_motions_were_written_goes_on(weights, tmp_path, monkeypatch, capsys):
     out, folder = tmp_path / "crowd", tmp_path / "crowd_motions"
     words = ["crowd", "--weights", weights, "--out", str(out), "--steps", "1", "--seconds", "0.8", "--characters", "3"]
@@ -165,15 +149,6 @@ def test_a_crowd_is_written_in_the_formats_that_are_asked_for(weights, tmp_path,
     assert sorted(path.name for path in folder.iterdir()) == left
     moved = [read_bvh(folder / f"{k}_{crowd.style(k)}.bvh").positions - crowd.motion(k).positions for k in range(2)]
     assert np.abs(moved).max() > 0.01  # seams are blended where people look
-
-
-@pytest.mark.slow
-def test_a_plan_without_a_number_keeps_the_usual_distance(weights, tmp_path):
-    words = ["crowd", "--weights", weights, "--steps", "1", "--seconds", "0.2", "--characters", "2"]
-    for name, plan, distance in (("usual", ["--plan"], MIN_DISTANCE), ("free", [], None)):
-        assert main([*words, *plan, "--out", str(tmp_path / name)]) == 0
-        assert read_crowd(tmp_path / name).settings["min_distance"] == distance
-    assert main([*words, "--plan", "1", "2", "--out", str(tmp_path / "two")]) == 2
 
 
 @pytest.mark.parametrize("seconds", ["0", "-5", "nan", "3601"])
@@ -412,10 +387,3 @@ def test_claims_outside_a_clone_say_where_to_run_them(monkeypatch, tmp_path, cap
     monkeypatch.setattr("f3amd_companion.ledger.claims.repository_root", lambda: tmp_path)
     assert main(["claims"]) == 2
     assert "run this in a clone of the repository" in capsys.readouterr().err
-
-
-def test_the_ledger_is_judged_by_its_own_command(monkeypatch):
-    seen = []
-    monkeypatch.setattr("f3amd_companion.ledger.claims.main", lambda *words: seen.append(words) or 1)
-    assert [main(["claims"]), main(["claims", "--accept", "--paper", "acmdm"])] == [1, 1]
-    assert seen == [(False, None), (True, "acmdm")]

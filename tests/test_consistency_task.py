@@ -5,16 +5,13 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pandas as pd
 import pytest
-from builders import HISTORY, WINDOW, tiny_camdm, tiny_packed, tiny_task, tiny_trained
+from builders import HISTORY, WINDOW, tiny_packed, tiny_task, tiny_trained
 
-from f3amd_companion.measuring import consistency_task, measure
+from f3amd_companion.measuring import consistency_task
 from f3amd_companion.measuring.consistency_task import ConsistencyTask
 from f3amd_lib.diffusion.schedules import variance_preserving_cosine
 from f3amd_lib.ground.profiles import load_profile
-from f3amd_lib.ground.records import read_table, run_record
-from f3amd_lib.ground.trees import weights_digest
 from f3amd_lib.training.optimise import advance, initial_state
 from f3amd_lib.training.pipeline import PreparedData
 
@@ -97,46 +94,3 @@ def test_phases_that_no_sampler_visits_are_refused(task):
     for number in (3, 2):
         with pytest.raises(ValueError, match=f"into {number} equal phases"):
             dataclasses.replace(task, num_phases=number)
-
-
-def test_rows_of_one_step_are_students_of_as_many_phases_and_the_walk_they_learned(tmp_path, monkeypatch):
-    levels = variance_preserving_cosine(8)
-    config = tiny_camdm(noise_levels=tuple(levels.levels.tolist()))
-    models = {"CAMDM": tiny_trained(config=config, diffusion=levels), "F3AMD-FNO-96-steady": tiny_trained()}
-    profile = load_profile("smoke", "synthetic", batch_size=2, window=WINDOW)
-    distilled, walked = [], []
-
-    def distil(prepared, profile, teacher, folder, *, num_steps, num_phases, batch_size):
-        distilled.append((teacher.diffusion.kind, folder.name, num_phases, num_steps))
-        return dataclasses.replace(teacher, params=jax.tree.map(lambda leaf: leaf + num_phases, teacher.params)), None
-
-    def measure_model(generator, packed, classifier, protocol, held_out, *, name):
-        walked.append((name, generator.sampler, generator.sigmas, weights_digest(generator.trained.params)))
-        row = {"model": name, "metric": "FID", "unit": "", "better": "down", "varies": "seeds", "value": 1.0}
-        return pd.DataFrame([row | {"window_frames": WINDOW, "steps": generator.num_steps, "seed": 0}]), None
-
-    monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path))
-    record = run_record(profile=profile, dataset="synthetic", seed=0, classifier_weights="cc")
-    for name, answer in {
-        "available_models": lambda profile: list(models),
-        "obtain_model": lambda prepared, profile, *, preset: (models[preset], None, "earlier run"),
-        "protocol_of": lambda *arguments: (None, None, dict(record)),
-        "distil": distil,
-        "measure_model": measure_model,
-    }.items():
-        monkeypatch.setattr(measure, name, answer)
-    use = pd.DataFrame([{"metric": "use_of_x", "value": 1.0}])
-    monkeypatch.setattr(measure.denoising, "input_use", lambda *arguments, **settings: use)
-    monkeypatch.setattr(measure.denoising, "held_out_condition", lambda *arguments: None)
-    path = measure.measure_one_step(PreparedData(tiny_packed(), WINDOW, HISTORY), profile)
-    steps = measure.STUDENT_STEPS["smoke"]
-    of_camdm = [("variance_preserving_cosine", f"M{phases}", phases, steps) for phases in (1, 2, 4)]
-    assert distilled == [*of_camdm, ("variance_exploding", "M1", 1, steps)]
-    assert {sampler for _, sampler, _, _ in walked} == {"ddim"}
-    names = ["CAMDM, by DDIM", *["CAMDM, distilled"] * 3, "F3AMD-FNO-96-steady, distilled"]
-    assert [name for name, *_ in walked] == names
-    for stride, (_, _, sigmas, _) in zip((1, 8, 4, 2), walked, strict=False):
-        np.testing.assert_allclose(sigmas, levels.grid(8)[::stride])
-    # The students walk, not their teachers; rows carry the teacher's weights, which they go stale with.
-    assert walked[0][3] == weights_digest(models["CAMDM"].params) and len({one[3] for one in walked}) == 5
-    assert read_table(path)[0]["steps"].tolist() == [8, 1, 2, 4, 1]

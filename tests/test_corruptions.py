@@ -7,7 +7,7 @@ import pytest
 from builders import refused, wandering_motion
 from scipy.spatial.transform import Rotation
 
-from f3amd_lib.measures import distributions, metrics
+from f3amd_lib.measures import metrics
 from f3amd_lib.measures.corruptions import CORRUPTIONS, corrupt, frozen_pose, noisy_motion, shuffled_frames
 from f3amd_lib.measures.real_clips import own_path
 from f3amd_lib.motion.rotations import matrix_from_yaw
@@ -111,11 +111,9 @@ def test_noise_has_the_stated_size():
         ("frozen pose", "ird_excess_cm", 0.0, 0.5),
         # Frames that jump metres.
         ("shuffled frames", "trajectory_error_m", 10.0, np.inf),
-        ("shuffled frames", "ird_excess_cm", 100.0, np.inf),
         ("shuffled frames", "joint_acceleration_cm", 100.0, np.inf),
         # Trembling.
         ("noisy motion", "trajectory_error_m", 1.5, np.inf),
-        ("noisy motion", "foot_sliding", 5.0, np.inf),
         ("noisy motion", "ird_excess_cm", 5.0, np.inf),
         ("noisy motion", "joint_acceleration_cm", 5.0, np.inf),
     ],
@@ -130,34 +128,6 @@ def test_every_bad_generator_is_smoother_than_a_walk_by_the_paper(name):
     """A root that jumps or trembles divides the acceleration of the joints away; so does a pose
     that is held. Lower, which the paper calls better, is here worse."""
     assert measured(name)["smoothness"] < 0.8 * measured()["smoothness"]
-
-
-def features(motions, frames=30):
-    """A stand-in for a classifier's features: posture and pace of each second, from the hips."""
-    rows = []
-    for motion in motions:
-        relative = motion.positions - motion.positions[:, :1]
-        own = np.einsum("tab,tjb->tja", matrix_from_yaw(-motion.yaw), relative)
-        own = own[:, motion.skeleton.toes + (5, 12)].reshape(motion.num_frames, -1)
-        for start in range(0, motion.num_frames - frames + 1, frames):
-            window = own[start : start + frames]
-            pace = 5.0 * np.abs(np.diff(window, axis=0)).mean(axis=0)
-            rows.append(np.concatenate([window.mean(axis=0), window.std(axis=0), pace]))
-    return np.array(rows)
-
-
-@pytest.mark.parametrize("name", CORRUPTIONS)
-def test_fid_and_emd_order_graded_corruptions(name):
-    """The stronger the corruption, the farther from other real walks of the same style."""
-    walks = [walker(seed) for seed in range(3)]
-    reference = features([walker(seed) for seed in range(3, 6)])
-    graded = []
-    for strength in (0.0, 0.3, 0.6, 1.0):
-        broken = [corrupt(name, walk, strength=strength, seed=7) for walk in walks]
-        graded.append(features(broken))
-    for distance in (distributions.frechet_distance, distributions.earth_movers_distance):
-        distances = [distance(each, reference) for each in graded]
-        assert np.all(np.diff(distances) > 0), distance.__name__
 
 
 # ----------------------------------------------------------------------------------------- errors

@@ -30,19 +30,6 @@ def test_a_network_that_returns_its_input_errs_by_the_noise(model_that):
     np.testing.assert_allclose(table["x0_error"] / table["x0_error"][0], np.divide(SIGMAS, 0.1))
 
 
-@pytest.mark.slow
-def test_a_network_that_ignores_its_input_errs_alike_everywhere(model_that):
-    trained = model_that(lambda x_noisy, sigma: 0.0 * x_noisy)
-    windows = tiny_windows()
-    table = denoising.x0_error_by_sigma(trained, windows, SIGMAS)
-    batch = spread_windows(windows, denoising.WINDOWS)
-    x0, _ = network_inputs(batch, trained.normaliser)
-    np.testing.assert_allclose(table["x0_error"], float(np.sqrt(np.mean(x0**2))), rtol=1e-5)
-    use = denoising.noise_use(MotionGenerator(trained, 1), windows)
-    assert use["x0_error_ratio"] == pytest.approx(1.0)
-    assert use["seed_spread_cm"] == pytest.approx(0.0, abs=1e-4)
-
-
 def test_a_network_is_asked_no_level_that_it_was_never_told(monkeypatch):
     windows, asked = tiny_windows(), []
 
@@ -141,25 +128,6 @@ def test_an_exact_denoiser_uses_its_input_and_not_the_level_alone(means):
     assert over_noise > 0.01
     # The mean of posterior means is the mean of the data, at every level.
     assert abs(over_levels) < 0.02 * over_noise
-
-
-def test_a_network_that_sees_sigma_alone_moves_with_it_though_it_ignores_its_input():
-    # 0.5 below sigma 1 and 0.3 above: its samples are 0.5 from 2 steps on, and 0.3 at 1.
-    answer = lambda x, sigma: 0.0 * x + jnp.where(sigma < 1.0, 0.5, 0.3)
-    estimates = estimates_on_a_walk(answer)
-    share = np.mean(np.unique(estimates, return_inverse=True)[1])
-    over_noise, over_levels = denoising.estimate_variances(estimates)
-    assert over_noise == pytest.approx(0.0, abs=1e-20)
-    assert over_levels == pytest.approx(0.2**2 * share * (1 - share))
-
-
-def test_variances_are_unbiased_in_few_seeds():
-    rng = np.random.default_rng(0)
-    own = rng.standard_normal((8, 20_000, 1)) + np.linspace(0, 1, 8)[:, None, None]
-    few = [denoising.estimate_variances(own[:, k : k + 5]) for k in range(0, 20_000, 5)]
-    over_noise, over_levels = np.mean(few, axis=0)
-    assert over_noise == pytest.approx(1.0, rel=0.02)
-    assert over_levels == pytest.approx(np.linspace(0, 1, 8).var(), rel=0.05)
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,7 @@ def data(monkeypatch) -> PreparedData:
 @pytest.mark.parametrize(
     ("name", "preset", "recipe", "held_out"),
     [
-        ("readings", "F3AMD-FNO-96", "CAMDM-units+compressed-decay", 0.8362607),
+        pytest.param("readings", "F3AMD-FNO-96", "CAMDM-units+compressed-decay", 0.8362607, marks=pytest.mark.slow),
         ("steady", "F3AMD-FNO-96-steady", "paper", 53.65742),
     ],
 )

@@ -4,10 +4,8 @@ pyproject.toml is the original. environment.yml repeats its ranges under conda's
 version inside each range for every supported Python and processor, and behind the plain install what an extra adds.
 """
 
-import ast
 import re
 import subprocess
-import sys
 import tomllib
 from pathlib import Path
 
@@ -28,16 +26,6 @@ EXTRAS = ("bench", "onnx", "site", "sweep", "web")
 UNHASHED = ("bench", "onnx")
 CONDA_NAMES = {"flatbuffers": "python-flatbuffers", "matplotlib": "matplotlib-base"}
 """What conda-forge calls a package that PyPI calls otherwise."""
-
-IMPORT_NAMES = {
-    "iree-base-compiler": "iree",
-    "iree-base-runtime": "iree",
-    "ipython": "IPython",
-    "pillow": "PIL",
-    "pot": "ot",
-    "pyyaml": "yaml",
-}
-"""What Python imports where it is not the package's name."""
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 LOCK_TEXT = (ROOT / "requirements.lock").read_text(encoding="utf-8")
@@ -151,27 +139,6 @@ def test_an_extra_is_handed_to_pip_with_its_hashes(extra, tmp_path):
     assert {entry[0] for entry in lock_extras.entries(wanted)} == asked
     added = pins(LOCK_TEXT, extra=extra).items() - pins(PLAIN).items()
     assert pins(wanted).items() == added
-
-
-def imported_packages(paths) -> set[str]:
-    """Top-level names that Python files import, anywhere in them."""
-    names = set()
-    for path in paths:
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Import):
-                names |= {alias.name for alias in node.names}
-            elif isinstance(node, ast.ImportFrom) and node.level == 0:
-                names.add(node.module)
-    return {name.split(".")[0] for name in names}
-
-
-def test_what_is_imported_is_declared():
-    own = {"f3amd_lib", "f3amd_companion", "f3amd_notebooks", "tests", "conftest"}
-    own |= {path.stem for folder in ("tests", "scripts") for path in (ROOT / folder).glob("*.py")}
-    declared = {IMPORT_NAMES.get(name, name) for name in ALL}
-    folders = ("f3amd_lib", "f3amd_companion", "notebooks/f3amd_notebooks", "tests")
-    files = [path for folder in folders for path in (ROOT / folder).rglob("*.py")]
-    assert imported_packages(files) - own - declared - set(sys.stdlib_module_names) == set()
 
 
 def test_the_version_is_the_same_everywhere():

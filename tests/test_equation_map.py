@@ -7,14 +7,6 @@ import json
 import pandas as pd
 import pytest
 from f3amd_notebooks import equation_map as map_module
-from f3amd_notebooks.equation_map import (
-    equation_labels,
-    equation_map,
-    equations_in_name,
-    equations_markdown,
-    mentioned_equations,
-    notebook_sections,
-)
 from f3amd_notebooks.readings import fill_reading, readings_table
 from f3amd_notebooks.stored_result import running_times
 
@@ -55,7 +47,9 @@ def test_mentions_are_read(text, expected):
 
 def known_mentions(text, paper="f3amd"):
     """Labels of a paper's equations that a text mentions."""
-    return {label for folder, label in mentioned_equations(text) if folder == paper} & set(equation_labels(paper))
+    return {label for folder, label in map_module.mentioned_equations(text) if folder == paper} & set(
+        map_module.equation_labels(paper)
+    )
 
 
 def write_notebook(path, *cells):
@@ -82,7 +76,7 @@ LOSSES = (
 
 
 def test_sections_know_their_equations_and_figures(tmp_path):
-    sections = notebook_sections(write_notebook(tmp_path / "04_losses.ipynb", *LOSSES))
+    sections = map_module.notebook_sections(write_notebook(tmp_path / "04_losses.ipynb", *LOSSES))
     assert [section.heading for section in sections] == ["4.1 Batches", "4.2 Losses",
                                                          "What we learned"]  # fmt: skip
     assert [section.number for section in sections] == ["4.1", "4.2", ""]
@@ -96,7 +90,7 @@ def test_the_map_points_to_sections_and_their_figures(tmp_path):
     write_notebook(tmp_path / "notebooks/04_losses.ipynb", *LOSSES)
     write_notebook(tmp_path / "notebooks/13_exercise_solutions.ipynb", ("text", "## 13.1\n\nEq. 11"))
     write_notebook(tmp_path / "notebooks/00_guide.ipynb", ("text", "## 0.1 Map\n\nEq. 11"))
-    rows = equation_map(root=tmp_path).set_index("equation")
+    rows = map_module.equation_map(root=tmp_path).set_index("equation")
     assert rows.loc["Eq. 11", ["notebooks", "cells", "figures"]].tolist() == [
         "04_losses", "4.2", "04_film, 04_terms",
     ]  # fmt: skip
@@ -108,7 +102,7 @@ def test_the_map_points_to_sections_and_their_figures(tmp_path):
 @pytest.fixture(scope="module")
 def whole_map():
     """The map of this checkout."""
-    return equation_map()
+    return map_module.equation_map()
 
 
 @pytest.mark.parametrize("column", ["functions", "tests", "notebooks", "cells", "figures"])
@@ -125,36 +119,25 @@ def test_every_equation_of_the_paper_has_an_entry_in_every_column(whole_map, col
 @pytest.mark.parametrize("paper", papers.paper_folders())
 def test_every_numbered_equation_of_a_paper_has_code_or_a_reason(paper):
     about = papers.load_paper_file("paper", paper)
-    numbers = [int(label[4:]) for label in equation_labels(paper) if label.startswith("Eq. ")]
+    numbers = [int(label[4:]) for label in map_module.equation_labels(paper) if label.startswith("Eq. ")]
     assert numbers == [*range(1, about["numbered_equations"] + 1)]
-    computed = dict(equation_map(paper=paper)[["equation", "functions"]].itertuples(index=False))
+    computed = dict(map_module.equation_map(paper=paper)[["equation", "functions"]].itertuples(index=False))
     for entry in about["equation"]:
         assert bool(computed[entry["label"]]) != bool(entry.get("cited_only")), entry["label"]
 
 
 def test_the_committed_page_is_what_the_code_says():
     page = (repository_root() / "docs/equations.md").read_text(encoding="utf-8")
-    assert page == equations_markdown(), "write it again: python -m f3amd_notebooks.equation_map"
+    assert page == map_module.equations_markdown(), "write it again: python -m f3amd_notebooks.equation_map"
     for paper in papers.paper_folders():
         about = papers.load_paper_file("paper", paper)
         table = page.split(f"## {about['name']}\n")[1].split("\n## ")[0]
-        assert [line.split(" | ")[0][2:] for line in table.splitlines()[3:]] == equation_labels(paper)
+        assert [line.split(" | ")[0][2:] for line in table.splitlines()[3:]] == map_module.equation_labels(paper)
 
 
 def unknown_equations(mentions) -> list[str]:
     """Return equations that are mentioned and no paper has."""
-    return sorted(f"{paper} {label}" for paper, label in mentions if label not in equation_labels(paper))
-
-
-@pytest.mark.parametrize(
-    ("text", "unknown"),
-    [
-        ("Eq. 9, MotionPCM Eqs 15 to 19 and ACMDM Eq. 2", []),
-        ("the step of Eq. 15; ACMDM Eqs 2 and 3; as in CAMDM Eq. 30", ["acmdm Eq. 3", "f3amd Eq. 15", "f3amd Eq. 30"]),
-    ],
-)
-def test_equations_that_no_paper_has_are_found(text, unknown):
-    assert unknown_equations(mentioned_equations(text)) == unknown
+    return sorted(f"{paper} {label}" for paper, label in mentions if label not in map_module.equation_labels(paper))
 
 
 def test_docstrings_and_tests_name_equations_that_are_printed():
@@ -163,8 +146,8 @@ def test_docstrings_and_tests_name_equations_that_are_printed():
     for path in files:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef)):
-                mentions = mentioned_equations(ast.get_docstring(node) or "")
-                unknown = unknown_equations(mentions | equations_in_name(getattr(node, "name", "")))
+                mentions = map_module.mentioned_equations(ast.get_docstring(node) or "")
+                unknown = unknown_equations(mentions | map_module.equations_in_name(getattr(node, "name", "")))
                 wrong += [f"{path.name}: {name}" for name in unknown]
     assert len(files) > 100 and wrong == []
 
@@ -208,9 +191,3 @@ def test_a_broken_open_point_is_refused(changes, message):
     assert fill_reading(READING | {"field": "F3AMDConfig.dropout"}, "f.toml", CONFIGS) == str(
         F3AMDConfig(channels=1, num_styles=1).dropout
     )
-
-
-@pytest.mark.parametrize("paper", ["f3amd", "acmdm", "motionpcm"])
-def test_open_points_are_told_once_with_a_reason(paper):
-    table = readings_table(paper=paper)
-    assert table["open point"].is_unique and (table[["the paper", "why"]] != "").all(axis=None)

@@ -420,63 +420,26 @@ def test_a_wrong_answer_gets_a_hint(number, answer):
     assert hint(number, answer)
 
 
-def _at_the_neighbour(levels):
-    def target(denoise, student, x, sigma, lower, edge):
-        return student(_neighbour(denoise, x, sigma, lower), *levels(lower, edge))
-
-    return target
-
-
-def _rolled(answer):
-    """An answer whose numbers have changed places."""
-    return lambda *given: np.roll(np.asarray(answer(*given)), 1, axis=-1)
-
-
-DIAGNOSED = [
-    ("2.d", [114, 2253], "order"),
-    ("2.e", [_LATE, _EARLY], "order"),
-    ("10.e", [1.001, 82.45, 0.0], "order"),
-    ("11.b", [5.0, 4.0], "order"),
-    ("12.b", [32, 7, 2, 1], "order"),
-    ("C1.a", lambda *given: RIGHT["C1.a"][0](*given)[::-1], "order"),
-    ("C1.b", WRONG["C1.b"][1], "same sign"),
-    ("C2.a", lambda *given: _eta(*given[:4], 0.0, given[5]), "fresh noise is missing"),
-    ("C2.a", WRONG["C2.a"][1], "deviations do not add"),
-    ("C2.a", lambda x, d, s, t, eta, noise: _eta(x, d, s, t, eta * s / t, noise), "factor"),
-    ("C2.a", lambda x, d, s, *rest: _eta(s * x, s * d, s, *rest) + (1 - s) * d, "divide by sigma"),
-    ("C2.b", (2.0, 1.55, 2.0), "order"),
-    ("C3.b", WRONG["C3.b"][0], "order"),
-    ("C4.b", (0.1, 0.2), "order"),
-    ("C5.a", _rolled(_karras), "order"),
-    ("C5.b", _rolled(_loss_weights), "order"),
-    ("C6.b", WRONG["C6.b"][0], "order"),
-    ("C7.b", WRONG["C7.b"][0], "order"),
-    ("C8.b", _at_the_neighbour(lambda lower, edge: (edge, lower)), "wrong levels"),
-    ("C8.b", lambda denoise, student, x, sigma, *_: denoise(x, sigma), "guess is no neighbour"),
-    ("C8.b", lambda d, f, x, s, t, e: f(d(x, s) + s / t * (x - d(x, s)), t, e), "share lower / sigma"),
-    ("C9.b", WRONG["C9.b"][0], "order"),
-    ("C10.b", WRONG["C10.b"][0], "order"),
-]
-"""Wrong answers, and what their hint has to name."""
-
-
-@pytest.mark.parametrize("number, answer, named", DIAGNOSED)
+@pytest.mark.parametrize(
+    "number, answer, named",
+    [
+        ("2.d", [114, 2253], "order"),
+        ("C5.a", lambda *given: np.roll(_karras(*given), 1, axis=-1), "order"),
+        ("C1.b", WRONG["C1.b"][1], "same sign"),
+        ("C2.a", lambda *given: _eta(*given[:4], 0.0, given[5]), "fresh noise is missing"),
+        ("C2.a", WRONG["C2.a"][1], "deviations do not add"),
+        ("C2.a", lambda x, d, s, t, eta, noise: _eta(x, d, s, t, eta * s / t, noise), "factor"),
+        ("C2.a", lambda x, d, s, *rest: _eta(s * x, s * d, s, *rest) + (1 - s) * d, "divide by sigma"),
+        ("C8.b", lambda denoise, student, x, sigma, *_: denoise(x, sigma), "guess is no neighbour"),
+        ("C8.b", lambda d, f, x, s, t, e: f(d(x, s) + s / t * (x - d(x, s)), t, e), "share lower / sigma"),
+    ],
+)
 def test_a_hint_names_the_mistake(number, answer, named):
     assert named in hint(number, answer)
 
 
 def test_every_exercise_is_tried_both_ways():
     assert list(RIGHT) == list(WRONG) == list(CHECKS)
-
-
-def test_the_share_of_spread_that_is_asked_for_is_what_the_two_walks_leave():
-    denoise = GaussianMixture([0.0], width=1.0).denoise
-    for levels, share in zip(_LEVELS, RIGHT["10.b"][0], strict=True):
-        literal, rescaled = (
-            float([*samplers.walk(name, denoise, levels[:1], levels)][-2].x_noisy[0])
-            for name in ("ddim_literal", "ddim")
-        )
-        np.testing.assert_allclose(literal / rescaled, share, rtol=1e-3)  # in float32
 
 
 def test_appendix_f_defines_a_root_that_its_update_does_not_use():

@@ -19,7 +19,7 @@ NOTEBOOKS = Path(__file__).resolve().parents[1] / "notebooks"
 def tagged_cells(tag: str) -> list[tuple[str, str]]:
     """(number, source) of each cell with a tag."""
     paths = sorted(NOTEBOOKS.glob("[0-9][0-9]_*.ipynb")) + sorted(NOTEBOOKS.glob("course/[0-9][0-9]_*.ipynb"))
-    cells = [cell for path in paths for cell in nbformat.read(path, as_version=4).cells]
+    cells = [cell for path in paths for cell in nbformat.v4.reads(path.read_text("utf-8")).cells]
     return [(asked_number(cell.source), cell.source) for cell in cells if tag in cell.metadata.get("tags", [])]
 
 

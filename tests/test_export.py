@@ -17,7 +17,6 @@ import pytest
 from builders import refused
 
 from f3amd_companion.serving import artefact as artefact_module
-from f3amd_companion.serving import export as export_module
 from f3amd_companion.serving.artefact import load_artefact, manifest_digest
 from f3amd_companion.serving.export import export_model, export_round, save_artefact
 from f3amd_lib.diffusion.schedules import variance_exploding, variance_preserving_cosine
@@ -163,11 +162,6 @@ def load_shapes(folder: Path) -> dict:
     return {item["name"]: item["shape"] for item in manifest["inputs"]}
 
 
-def test_a_program_does_not_say_which_files_made_it(exported):
-    for program in (exported.exported.mlir_module_serialized, exported.exported.serialize()):
-        assert b".py" not in program
-
-
 def test_scales_and_styles_travel_with_a_trained_model(trained, jax_folder):
     artefact = load_artefact(jax_folder, runtime="jax")
     normaliser = trained.normaliser
@@ -251,23 +245,6 @@ def test_nothing_of_a_user_is_overwritten(exported, tmp_path):
     (folder / "manifest.json").write_text("{}")
     refused("not the manifest of an artefact", save, overwrite=True)
     assert (folder / "notes.txt").read_text() == "mine"
-
-
-def test_an_artefact_of_which_a_part_was_written_is_none_and_is_written_again(exported, tmp_path, monkeypatch):
-    write = export_module.write_whole
-
-    def full_disk(path, content):
-        if path.name == "manifest.json":
-            raise OSError("no space left")
-        return write(path, content)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(export_module, "write_whole", full_disk)
-        with pytest.raises(OSError, match="no space left"):
-            save_artefact(tmp_path / "new", exported, name="new", targets=())
-    refused("no such file, so", load_artefact, tmp_path / "new", runtime="jax")
-    save_artefact(tmp_path / "new", exported, name="new", targets=())
-    assert load_artefact(tmp_path / "new", runtime="jax").manifest["model"] == "new"
 
 
 def test_a_trained_model_is_exported_with_its_own_schedule(trained, tmp_path):

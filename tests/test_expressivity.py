@@ -9,8 +9,6 @@ from f3amd_notebooks import expressivity as ex
 from flax import nnx
 
 from f3amd_lib.motion.rotations import matrix_from_yaw, rotation_6d_from_matrix
-from f3amd_lib.networks.conditioning import CONDITIONINGS, conditioning_layer
-from f3amd_lib.networks.spectral import SpectralConvolution
 
 # -------------------------------------------------------------------------------------- modes
 
@@ -37,18 +35,6 @@ def walking_frames(num_frames=16, windows=2):
     root = np.stack([0 * time, 0 * time + 1.0, 1.2 * time], axis=-1)
     flat = np.asarray(rotation_6d_from_matrix(rotations)).reshape(windows, num_frames, -1)
     return np.concatenate([np.tile(root, (windows, 1, 1)), flat], axis=-1)
-
-
-def test_the_squares_of_a_spectrum_add_up_to_the_variance():
-    frames = walking_frames()
-    table = ex.motion_spectrum(SKELETON, frames, fps=16.0)
-    positions = ex.group_positions(SKELETON, frames)
-    for group, values in positions.items():
-        spread = np.mean(np.sum((values - values.mean(axis=1, keepdims=True)) ** 2, axis=-1))
-        for band in ("fourier", "cosine"):
-            rows = table[(table["band"] == band) & (table["group"] == group)]
-            np.testing.assert_allclose(rows["frequency_hz"], np.arange(9.0))
-            np.testing.assert_allclose(np.sum(rows["amplitude_cm"].to_numpy()[1:] ** 2), spread, rtol=1e-9, atol=1e-12)
 
 
 def test_a_walk_costs_its_root_at_the_ends_and_a_line_mends_it():
@@ -145,44 +131,3 @@ def test_three_blocks_of_two_channels_have_all_eight_delays():
 
 
 # ------------------------------------------------------------------------------- ways of c in
-
-WIDTH, WINDOW = 3, 6
-BASES = {
-    frames: SpectralConvolution(WIDTH, WIDTH, frames // 2 + 1, rngs=nnx.Rngs(2)) for frames in (WINDOW, 2 * WINDOW)
-}
-
-
-@pytest.fixture(scope="module")
-def blocks():
-    """Name of a way in -> (z, c) [1, T, D] to one block before its SiLU."""
-    rng = np.random.default_rng(0)
-    ways = {name: conditioning_layer(name, WIDTH, WIDTH, rngs=nnx.Rngs(1)) for name in CONDITIONINGS}
-    modulation = ways["adaln_zero"].modulation.kernel
-    modulation[...] = jnp.asarray(0.5 * rng.standard_normal(modulation.shape), jnp.float32)
-
-    def block(name):
-        def run(z, c):
-            both = jnp.concatenate([c, z], axis=1) if name == "concatenation" else z
-            base = BASES[both.shape[1]]
-            return ex.without_activation(ways[name], base, both, c)[:, -WINDOW:]
-
-        return jax.jit(run)
-
-    return {name: block(name) for name in CONDITIONINGS}
-
-
-def draw(*shape, seed=0):
-    return jnp.asarray(np.random.default_rng(seed).standard_normal(shape), jnp.float32)
-
-
-def test_a_condition_meets_the_signal_where_each_way_lets_it(blocks):
-    z, c, frame = draw(WINDOW, WIDTH), draw(WINDOW, WIDTH, seed=1), 4
-    maps = {name: ex.interaction_map(block, z, c, frame) for name, block in blocks.items()}
-    others = np.arange(WINDOW) != frame
-    assert (maps["film"][others] < 1e-6).all() and (maps["film"][frame] > 1e-4).all()
-    assert maps["concatenation"].max() < 1e-6
-    before, gate = maps["adaln_zero"][others], maps["adaln_zero"][frame]
-    diagonal = np.eye(WINDOW, dtype=bool)[others]
-    assert (gate > 1e-4).all() and (before[diagonal] > 1e-4).all()
-    assert (before[~diagonal] < 1e-6).all()
-    assert np.mean(maps["cross_attention"] > 1e-6) > 0.9

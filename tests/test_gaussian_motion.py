@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from f3amd_notebooks.gaussian_motion import ExactFrames, ExactHidden, GaussianMotion
+from f3amd_notebooks.gaussian_motion import ExactFrames, GaussianMotion
 
 from f3amd_lib.diffusion.flow import solve
 from f3amd_lib.diffusion.schedules import straight
@@ -72,19 +72,3 @@ def test_blocks_draw_the_frames_that_they_should():
     found = np.cov(np.asarray(jax.jit(lambda: draw(COVARIANCE))())[..., 0, 0].T)
     np.testing.assert_allclose(found, COVARIANCE, atol=0.15)
     assert np.abs(np.cov(np.asarray(noise)[..., 0, 0].T) - COVARIANCE).max() > 0.5
-
-
-def test_hidden_frames_are_told_what_is_known_and_nothing_of_each_other():
-    network = ExactHidden(COVARIANCE)
-    values = np.random.default_rng(4).normal(size=(2, 6))
-    hidden = np.array([[False, False, True, True, True, True], [True] * 6])
-    mean, variance = network.look(jnp.asarray(values)[..., None, None], jnp.asarray(hidden), None)
-    gain = COVARIANCE[2:, :2] @ np.linalg.inv(COVARIANCE[:2, :2])
-    np.testing.assert_allclose(mean[0, 2:], gain @ values[0, :2], atol=1e-3)
-    np.testing.assert_allclose(variance[0, 2:], np.diag(COVARIANCE[2:, 2:] - gain @ COVARIANCE[:2, 2:]), atol=1e-3)
-    np.testing.assert_allclose(mean[1], 0, atol=1e-3)
-    np.testing.assert_allclose(variance[1], np.diag(COVARIANCE), atol=1e-3)
-    state, t = jnp.asarray(values)[..., None, None], 0.3
-    answer = network(state, t, (mean, variance))[..., 0, 0]
-    clean = mean + t * variance / (t**2 * variance + (1 - t) ** 2) * (values - t * mean)
-    np.testing.assert_allclose(answer, (clean - values) / (1 - t), atol=1e-4)

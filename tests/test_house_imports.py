@@ -152,11 +152,3 @@ def test_the_core_runs_without_the_rest():
 @pytest.mark.parametrize("package", ["f3amd_lib", "f3amd_companion"])
 def test_a_package_alone_imports_nothing(package):
     assert modules_after(f"bare = set(sys.modules)\nimport {package}\nprint(*set(sys.modules) - bare)") == [package]
-
-
-def test_the_four_roads_are_short_and_lead_through_files_that_exist():
-    text = (ROOT / "docs" / "house.md").read_text(encoding="utf-8").split("## Four roads\n")[1].split("\n## ")[0]
-    roads = [re.findall(r"`([\w/]+\.\w+)`", line) for line in text.split("\n- ")[1:]]
-    assert len(roads) == 4 and all(2 <= len(files) <= 4 for files in roads)
-    there = lambda file: any((ROOT / package / file).is_file() for package in HOUSES)
-    assert [file for files in roads for file in files if not there(file)] == []

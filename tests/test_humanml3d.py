@@ -179,37 +179,6 @@ def test_parts_of_a_motion_have_the_vectors_and_the_folder_the_statistics_that_a
     assert np.isfinite(computed).all() and np.abs(computed - vectors[40:100]).max() > 0.01  # faces otherwise
 
 
-@pytest.mark.slow
-def test_a_folder_with_ten_broken_records_of_sixty_trains(tmp_path, caplog):
-    folder = write_tree(tmp_path / "set")
-    names = {split: [f"{split}{k}" for k in range(count)] for split, count in (("train", 50), ("val", 7), ("test", 3))}
-    for split, every in names.items():
-        (folder / f"{split}.txt").write_text("\n".join(every))
-        for name in every:
-            for part, known in (
-                ("new_joints", "000001.npy"),
-                ("new_joint_vecs", "000001.npy"),
-                ("texts", "000001.txt"),
-            ):
-                shutil.copy(folder / part / known, folder / part / known.replace("000001", name))
-    for k in range(5):
-        (folder / "texts" / f"train{k}.txt").write_text("#x#0.0#0.0\n")
-        put(f"train{k + 5}", np.full((60, 22, 3), np.inf))(folder)
-    words = "train --data folder --profile smoke --preset ACMDM-S-PS22-raw-n2 --steps 2 --batch-size 4 --window 40"
-    assert main([*words.split(), "--source", str(folder), "--out", str(tmp_path / "models")]) == 0
-    assert "10 of 60 records are broken and left out: train0: " in caplog.text
-    assert list((tmp_path / "models").glob("*.safetensors"))
-
-
-def test_caption_lines_are_read_as_they_were_written():
-    line = captioned_folder.write_caption_line("A man's self-assured walk, twice.")
-    assert (
-        line
-        == "A man's self-assured walk, twice.#a/OTHER man's/OTHER self-assured/OTHER walk/OTHER twice/OTHER#0.0#0.0"
-    )
-    assert humanml3d.read_caption_line(line, "here") == ("A man's self-assured walk, twice.", 0.0, 0.0)
-
-
 # ------------------------------------------------------------------------ from BVH files with a table
 
 

@@ -17,10 +17,6 @@ CHAIN = Skeleton(("a", "b", "c", "d"), (-1, 0, 1, 2), [[0, 0, 0], [0, 1, 0], [0,
 SKELETONS = {"six joints": SKELETON, "walker": WALKER, "a chain with a bone of no length": CHAIN}
 
 
-def lengths(skeleton, positions):
-    return np.linalg.norm(positions[:, 1:] - positions[:, list(skeleton.parents[1:])], axis=-1)
-
-
 @pytest.mark.parametrize("skeleton", SKELETONS.values(), ids=SKELETONS)
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**31), bend=st.floats(0.0, 3.0))
@@ -33,18 +29,6 @@ def test_positions_of_the_skeleton_are_met_exactly(skeleton, seed, bend):
     np.testing.assert_allclose(forward_kinematics(skeleton, root_position, found), positions, atol=1e-5)
     np.testing.assert_allclose(found @ np.swapaxes(found, -1, -2), np.broadcast_to(np.eye(3), found.shape), atol=1e-9)
     np.testing.assert_allclose(np.linalg.det(found), 1.0)
-
-
-@pytest.mark.parametrize("skeleton", [SKELETON, WALKER], ids=["six joints", "walker"])
-@settings(max_examples=10, deadline=None)
-@given(seed=st.integers(0, 2**31))
-def test_positions_of_no_skeleton_are_not_met_and_bones_stay(skeleton, seed):
-    nonsense = np.random.default_rng(seed).normal(size=(4, skeleton.num_joints, 3))
-    made, residual = fitted(Motion.from_positions(skeleton, nonsense))
-    assert residual.mean() > 0.2
-    np.testing.assert_allclose(
-        lengths(skeleton, made.positions), np.tile(np.linalg.norm(skeleton.offsets[1:], axis=-1), (4, 1)), atol=1e-9
-    )
 
 
 def test_the_residual_tells_how_far_a_bone_was_stretched():

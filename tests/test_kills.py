@@ -15,7 +15,6 @@ import os
 import resource
 import signal
 import sys
-import time
 import traceback
 from collections.abc import Callable
 from pathlib import Path
@@ -27,7 +26,6 @@ import pytest
 import tqdm
 from builders import HISTORY, WINDOW, captioned_walks, tiny_packed, tiny_trained
 from safetensors.numpy import load_file
-from test_reproduce import PARAMETERS, write_notebook
 from test_text_judge import OneVectorAWord
 from test_text_models import STYLES, TINY
 
@@ -37,7 +35,6 @@ from f3amd_companion.measuring.campaign import Run
 from f3amd_lib.data import sources
 from f3amd_lib.data.packed import packed_dataset
 from f3amd_lib.ground import profiles
-from f3amd_lib.ground.files import locked
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.measures.protocol import Protocol
 from f3amd_lib.motion.bvh import write_bvh
@@ -132,18 +129,6 @@ def run_campaign(folder: Path) -> list[str]:
     return ["campaign", *SMOKE, "--batch-size", "4", "--out", str(folder / "runs")]
 
 
-def figures(folder: Path) -> list[str]:
-    """Run notebooks; the second one kills the command while it runs, once."""
-    profiles.repository_root = lambda: folder
-    write = "from f3amd_lib.ground.profiles import results_dir\n"
-    write += "(results_dir(data, profile) / 'tables' / '{}').write_text('{}')"
-    kill = f"import os, pathlib\nmark = pathlib.Path({str(folder)!r}) / 'killed'\nif not mark.exists():\n"
-    kill += "    mark.touch()\n    os.kill(os.getppid(), 9)"
-    write_notebook(folder / "notebooks", "00_first", PARAMETERS, write.format("first.txt", "first"))
-    write_notebook(folder / "notebooks", "01_second", PARAMETERS, kill, write.format("second.txt", "second"))
-    return ["figures", *SMOKE]
-
-
 PHASES = {phase.__name__: phase for phase in (data, dataset, train, train_text, measure_walking, run_campaign)}
 
 # ------------------------------------------------------------------------------------ what goes wrong
@@ -164,11 +149,6 @@ def count(folder: Path, at: int, then: Callable[[], None]) -> None:
 
 def kill(folder: Path, at: int) -> None:
     count(folder, at, lambda: os.kill(os.getpid(), signal.SIGKILL))
-
-
-def stop(folder: Path, at: int) -> None:
-    """Until somebody lets it go on."""
-    count(folder, at, lambda: os.kill(os.getpid(), signal.SIGSTOP))
 
 
 def full_disk(folder: Path, at: int) -> None:
@@ -192,7 +172,7 @@ def command(phase: str, folder: Path, fault: str | None, at: int, answer) -> Non
     tqdm.tqdm.status_printer = staticmethod(lambda file: lambda bar: None)
     os.environ |= {"F3AMD_RESULTS_DIR": str(folder / "results"), "F3AMD_CACHE_DIR": str(folder / "cache")}
     try:
-        words = {"figures": figures, **PHASES}[phase](folder)
+        words = PHASES[phase](folder)
         if fault:
             globals()[fault](folder, at)
         answer.send((command_line.main(words), sys.stderr.getvalue().strip()))
@@ -281,21 +261,7 @@ def test_killed_at_each_file_it_ends_as_if_it_had_not_been(phase, start, whole, 
     assert left(tmp_path / "run") == expected
 
 
-def test_notebooks_that_another_process_runs_are_refused(start, tmp_path):
-    with locked(tmp_path / "runs/synthetic/smoke/notebooks/.01_second.lock", "running 01_second.ipynb"):
-        status, told = ended(start("figures", tmp_path))
-    assert status == 2 and "another process is running 01_second.ipynb there" in told and "\n" not in told
-    assert not list(tmp_path.rglob("*.txt"))  # before the first of them ran
-
-
-def test_notebooks_killed_while_one_runs_run_again(start, tmp_path):
-    assert ended(start("figures", tmp_path))[0] is None
-    results = tmp_path / "results/synthetic/smoke/tables"
-    assert [path.name for path in results.iterdir()] == ["first.txt"]
-    assert ended(start("figures", tmp_path)) == (0, "")
-    assert {path.name for path in results.iterdir()} >= {"first.txt", "second.txt", "run_summary.csv"}
-
-
+@pytest.mark.long
 @pytest.mark.parametrize("fault", ["full_disk", "read_only"])
 @pytest.mark.parametrize("phase", PHASES)
 def test_without_room_or_right_it_says_so_in_one_line_and_the_next_call_works(phase, fault, start, whole, tmp_path):
@@ -305,25 +271,4 @@ def test_without_room_or_right_it_says_so_in_one_line_and_the_next_call_works(ph
     assert status == 2 and len(told.strip().splitlines()) == 1, told
     assert told.startswith(f"f3amd {phase.split('_')[-1 if phase == 'run_campaign' else 0]}: ") and str(folder) in told
     assert ended(start(phase, folder)) == (0, "")
-    assert left(folder) == whole(phase)
-
-
-@pytest.mark.parametrize("phase", PHASES)
-def test_two_at_once_leave_what_one_leaves(phase, start, whole, tmp_path):
-    """The second is refused while the first works, or does the same beside it."""
-    folder = tmp_path / "run"
-    first = start(phase, folder, "stop", 2 if phase == "train_text" else 1)  # its first is the captions' cache
-    status = Path(f"/proc/{first[0].pid}/stat")
-    while status.read_text().rsplit(")")[-1].split()[0] != "T":
-        time.sleep(0.05)
-        assert first[0].is_alive()
-    second = ended(start(phase, folder))
-    os.kill(first[0].pid, signal.SIGCONT)
-    one = ended(first)
-    if phase in ("data", "dataset"):  # no lock: each writes a file or folder of its own, whole
-        assert second == (0, "")
-        assert one[0] == (0 if phase == "data" else 2) and len(one[1].splitlines()) == one[0] // 2
-    else:
-        assert one == (0, "")
-        assert second[0] == 2 and "another process" in second[1] and len(second[1].splitlines()) == 1
     assert left(folder) == whole(phase)

@@ -19,7 +19,7 @@ COURSE = Path(__file__).resolve().parents[1] / "notebooks" / "course"
 
 def cells(name: str, tag: str) -> dict[str, tuple[str, str]]:
     """By lab, the text before each cell with a tag, and its code."""
-    whole = nbformat.read(COURSE / name, as_version=4).cells
+    whole = nbformat.v4.reads((COURSE / name).read_text("utf-8")).cells
     found = [
         (whole[place - 1].source, cell.source)
         for place, cell in enumerate(whole)

@@ -25,10 +25,8 @@ from f3amd_lib.text.data.text_encoders import embed_captions, load_text_encoder
 from f3amd_lib.text.data.text_motions import text_motions
 from f3amd_lib.text.sampling import motionpcm_sampling
 from f3amd_lib.text.sampling.motionpcm_sampling import (
-    decode_latent,
     guidance_of,
     latent_motions,
-    reconstruction,
     sample_latent_student,
     sample_student,
     sample_teacher,
@@ -36,13 +34,6 @@ from f3amd_lib.text.sampling.motionpcm_sampling import (
 )
 from f3amd_lib.text.stages import text_models, train_stage
 from f3amd_lib.text.stages.motionpcm_training import frame_statistics
-from f3amd_lib.text.stages.text_models import (
-    find_text_model,
-    is_latent_preset,
-    load_text_model,
-    named_model,
-    text_model_files,
-)
 from f3amd_lib.training import optimise
 from f3amd_lib.training.checkpoints import network_with
 from f3amd_lib.training.pipeline import PRETRAINED_DIR
@@ -72,24 +63,24 @@ def test_motionpcms_files_are_not_taken_for_acmdms(tmp_path, monkeypatch):
     (tmp_path / "text").mkdir()
     for name in ("ACMDM-S-PS22-raw-n3", "MotionPCM-M1-small", "MotionPCM-VAE-small"):  # the newest comes last
         (tmp_path / "text" / f"{name}.safetensors").touch()
-    assert find_text_model("bandai").name == "ACMDM-S-PS22-raw-n3.safetensors"
+    assert text_models.find_text_model("bandai").name == "ACMDM-S-PS22-raw-n3.safetensors"
     monkeypatch.setattr(text_models, "text_model_folders", lambda _: [tmp_path / "none", tmp_path / "text"])
     for asked in ("motionpcm", "MotionPCM-M1-small"):
-        assert find_text_model("bandai", asked) == tmp_path / "text" / "MotionPCM-M1-small.safetensors"
+        assert text_models.find_text_model("bandai", asked) == tmp_path / "text" / "MotionPCM-M1-small.safetensors"
     with pytest.raises(ValueError, match="no trained MotionPCM-M4-small .* f3amd train --preset MotionPCM-M4-small"):
-        find_text_model("bandai", "MotionPCM-M4-small")
+        text_models.find_text_model("bandai", "MotionPCM-M4-small")
     # A student is trained for one number of steps: the steps that are asked for choose it.
     for steps, wanted in ((None, "M1"), (1, "M1"), (2, "M2"), (4, "M4")):
-        name = named_model("MotionPCM", steps)
+        name = text_models.named_model("MotionPCM", steps)
         assert name == f"MotionPCM-{wanted}-small"
         assert presets.find_preset(name).training.get("num_phases", 1) == (steps or 1)
-    assert named_model("MotionPCM-M1-small", 4) == "MotionPCM-M1-small"
+    assert text_models.named_model("MotionPCM-M1-small", 4) == "MotionPCM-M1-small"
     with pytest.raises(ValueError, match="no trained MotionPCM-M2-small"):
-        find_text_model("bandai", "motionpcm", num_steps=2)
+        text_models.find_text_model("bandai", "motionpcm", num_steps=2)
     for steps in (3, 50):
         with pytest.raises(ValueError, match=f"for 1, 2 or 4 steps, none for {steps}; .* MotionPCM-teacher-small"):
-            find_text_model("bandai", "motionpcm", num_steps=steps)
-    assert is_latent_preset("MotionPCM (1-step)") and not is_latent_preset("ACMDM-S-PS22")
+            text_models.find_text_model("bandai", "motionpcm", num_steps=steps)
+    assert text_models.is_latent_preset("MotionPCM (1-step)") and not text_models.is_latent_preset("ACMDM-S-PS22")
 
 
 SHIPPED = PRETRAINED_DIR / "bandai" / "text"
@@ -115,7 +106,7 @@ def test_the_command_asks_the_shipped_student_once_with_its_own_weights_key_and_
     assert command_line.main([*words, "--model", "motionpcm", "--steps", "1"]) == 0
     ((name, motion),), ((shape, times),) = made, asked
     assert (name, shape, times) == ("MotionPCM-M1-small", (1, 16, 32), [999, 0])
-    student = load_text_model(SHIPPED / "MotionPCM-M1-small.safetensors")
+    student = text_models.load_text_model(SHIPPED / "MotionPCM-M1-small.safetensors")
     pooled = embed_captions(["a person raises the left hand"], load_text_encoder()).pooled
     wanted = latent_motions(student, pooled, 24, jax.random.key(3), guidance=14.0)[0]
     other = latent_motions(student, pooled, 24, jax.random.key(3), guidance=5.0)[0]
@@ -128,7 +119,9 @@ def test_the_command_asks_the_shipped_student_once_with_its_own_weights_key_and_
 
 
 def test_a_student_is_told_no_guidance_that_it_has_never_heard():
-    student, teacher = (load_text_model(SHIPPED / f"MotionPCM-{name}-small.safetensors") for name in ("M1", "teacher"))
+    student, teacher = (
+        text_models.load_text_model(SHIPPED / f"MotionPCM-{name}-small.safetensors") for name in ("M1", "teacher")
+    )
     assert [guidance_of(student, 1, w) for w in (None, 5.0, 15.0)] == [14.0, 5.0, 15.0]
     assert [guidance_of(teacher, 50, w) for w in (None, 0.0, 20.0)] == [6.5, 0.0, 20.0]
     told = {**student.record["identity"]["training"], "consistency": "latent"}
@@ -166,7 +159,7 @@ def test_each_stage_sees_training_clips_alone_and_keeps_the_weights_that_are_use
     monkeypatch.setattr(train_stage, "train_in_legs", loop)
     watched = []
     student = train_stage.train_stage(data, OneVectorAWord(), PROFILE, "tiny-M2", folder=tmp_path, **QUIET)
-    teacher = load_text_model(text_model_files(PROFILE, "tiny-teacher", folder=tmp_path).model)
+    teacher = text_models.load_text_model(text_models.text_model_files(PROFILE, "tiny-teacher", folder=tmp_path).model)
     ones, twos = (lambda tree, value=value: all((leaf == value).all() for leaf in jax.tree.leaves(tree))
                   for value in (1.0, 2.0))  # fmt: skip
     # The student's moving average is its target and no more; of the others the average is what is used.
@@ -203,7 +196,7 @@ def test_what_an_earlier_version_began_goes_on_by_the_facing_that_it_knows(data,
         tasks.append(task)
         return types.SimpleNamespace(step=task.config.num_steps, averaged=optimise.initial_state(task).params), []
 
-    tasks, files = [], text_model_files(PROFILE, "tiny-VAE", folder=tmp_path)
+    tasks, files = [], text_models.text_model_files(PROFILE, "tiny-VAE", folder=tmp_path)
     monkeypatch.setattr(train_stage, "train_in_legs", loop)
     train = partial(train_stage.train_stage, data, OneVectorAWord(), PROFILE, folder=tmp_path, **QUIET)
     to_dict = presets.find_family("latent autoencoder")[0].to_dict
@@ -223,9 +216,9 @@ def test_what_an_earlier_version_began_goes_on_by_the_facing_that_it_knows(data,
     if not finished:
         assert int(optimise.restore_state(files.state, tasks[1]).step) == 0
         assert np.array_equal(tasks[1].clips.frames, earlier.clips.frames)
-    assert not load_text_model(files.model).autoencoder.released_facing
+    assert not text_models.load_text_model(files.model).autoencoder.released_facing
     vectors = earlier.statistics.normalise(data.select([0]).redundant_vectors(released=False))
-    coder = Compiled(network_with(earlier.model_config, load_text_model(files.model).autoencoder_params))
+    coder = Compiled(network_with(earlier.model_config, text_models.load_text_model(files.model).autoencoder_params))
     seen = coder.encode(np.pad(vectors, ((0, 56), (0, 0)))[None], np.arange(96)[None] < 40)[0]
     np.testing.assert_allclose(teacher.clips.mean[0], seen[0], atol=1e-4)
 
@@ -236,7 +229,7 @@ def test_a_teacher_is_guided_away_from_what_its_encoder_makes_of_no_words(data, 
 
     monkeypatch.setattr(train_stage, "train_in_legs", loop)
     made = train_stage.train_stage(data, OneVectorAWord(), PROFILE, "tiny-teacher", folder=tmp_path, **QUIET)
-    again = load_text_model(text_model_files(PROFILE, "tiny-teacher", folder=tmp_path).model)
+    again = text_models.load_text_model(text_models.text_model_files(PROFILE, "tiny-teacher", folder=tmp_path).model)
     network, text, noise = made.network(), np.full((1, 8), 0.5), jax.random.normal(jax.random.key(0), (1, 2, 3))
     network.output.kernel[...] = jax.random.normal(jax.random.key(1), network.output.kernel.shape)
     by_hand, zeros = (
@@ -251,9 +244,11 @@ def test_a_teacher_is_guided_away_from_what_its_encoder_makes_of_no_words(data, 
 @pytest.mark.slow
 def test_a_student_is_trained_by_name_with_all_before_it(data, tmp_path, monkeypatch):
     made = train_stage.train_stage(data, OneVectorAWord(), PROFILE, "tiny-M2", folder=tmp_path, **QUIET)
-    files = {name: text_model_files(PROFILE, name, folder=tmp_path).model for name in TINY}
-    teacher, student = (load_text_model(files[name]) for name in ("tiny-teacher", "tiny-M2"))
-    assert load_text_model(files["tiny-VAE"]).config is None and made.text_encoder == OneVectorAWord.identity
+    files = {name: text_models.text_model_files(PROFILE, name, folder=tmp_path).model for name in TINY}
+    teacher, student = (text_models.load_text_model(files[name]) for name in ("tiny-teacher", "tiny-M2"))
+    assert (
+        text_models.load_text_model(files["tiny-VAE"]).config is None and made.text_encoder == OneVectorAWord.identity
+    )
     for model in (teacher, student):
         for found, wanted in zip(
             *map(jax.tree.leaves, (model.autoencoder_params, made.autoencoder_params)), strict=True
@@ -263,7 +258,7 @@ def test_a_student_is_trained_by_name_with_all_before_it(data, tmp_path, monkeyp
     assert student.record["identity"]["training"]["num_phases"] == 2
     # Held-out losses of each stage lie in its history, the discriminator's among the student's.
     for name, term in (("tiny-VAE", "joints"), ("tiny-teacher", "loss"), ("tiny-M2", "discriminator")):
-        history, _ = read_table(text_model_files(PROFILE, name, folder=tmp_path).history)
+        history, _ = read_table(text_models.text_model_files(PROFILE, name, folder=tmp_path).history)
         assert np.isfinite(history[f"held_out_{term}"].dropna()).all() and history[f"held_out_{term}"].notna().any()
     # The same student from the teacher's file alone, where nothing else lies; other files are refused.
     elsewhere = tmp_path / "elsewhere"
@@ -308,14 +303,9 @@ def test_a_student_is_trained_by_name_with_all_before_it(data, tmp_path, monkeyp
         train_stage.train_stage(
             data, OneVectorAWord(), PROFILE, "tiny-VAE", folder=tmp_path, progress=False, batch_size=1
         )
-    # From noise to vectors of a frame, all numbers.
-    network, coder = network_with(made.config, made.params), network_with(made.autoencoder, made.autoencoder_params)
-    noise, text = jax.random.normal(jax.random.key(0), (2, 2, 3)), np.zeros((2, 8), np.float32)
-    latent = sample_student(network, made.schedule, text, noise, num_steps=2)
-    vectors = decode_latent(coder, made.statistics, latent, np.ones((2, 12), bool))
-    assert vectors.shape == (2, 12, 12 * data.skeleton.num_joints - 1) and np.isfinite(vectors).all()
     # The same by the one door: captions and lengths in, metres out, zero in padding; the steps that each may take.
-    key, draw = jax.random.key(1), lambda model, **how: latent_motions(model, text, [12, 8], jax.random.key(1), **how)
+    key, text = jax.random.key(1), np.zeros((2, 8), np.float32)
+    draw = lambda model, **how: latent_motions(model, text, [12, 8], key, **how)
     first = draw(made)
     assert first.shape == (2, 12, data.skeleton.num_joints, 3) and not first[1, 8:].any() and first[0].any()
     np.testing.assert_array_equal(first, latent_motions(made, text, [12, 8], key, num_steps=2, guidance=14.0))
@@ -324,10 +314,6 @@ def test_a_student_is_trained_by_name_with_all_before_it(data, tmp_path, monkeyp
     with pytest.raises(ValueError, match="tiny-M2 takes 2 steps, got 1"):
         draw(made, num_steps=1)
     with pytest.raises(ValueError, match="only an autoencoder"):
-        draw(load_text_model(files["tiny-VAE"]))
+        draw(text_models.load_text_model(files["tiny-VAE"]))
     with pytest.raises(ValueError, match="makes up to 40 frames, got 44"):
         latent_motions(made, text, 44, key)
-    # What a mean latent gives back is a motion of the same place and size, and not another clip's.
-    mask = np.ones((1, 40), bool)
-    again, positions = reconstruction(made, data.redundant_vectors()[None, :40], mask)
-    assert again.shape == (1, 40, 12 * data.skeleton.num_joints - 1) and np.isfinite(positions).all()

@@ -9,20 +9,19 @@ import pytest
 from compiled import Compiled
 from flax import nnx
 
-from f3amd_lib.diffusion.oracles import GaussianMixture
 from f3amd_lib.diffusion.schedules import variance_preserving_betas
 from f3amd_lib.motion import synthetic
 from f3amd_lib.motion.skeleton import resample
 from f3amd_lib.networks.presets import build_from_config
 from f3amd_lib.text.data.redundant import grouped_statistics
-from f3amd_lib.text.data.text_motions import AxisNormaliser, ClipTable, text_motions
+from f3amd_lib.text.data.text_motions import AxisNormaliser, text_motions
 from f3amd_lib.text.networks.motionpcm import (
     DiscriminatorConfig,
     LatentAutoencoderConfig,
     LatentDenoiserConfig,
     student_of,
 )
-from f3amd_lib.text.phases import cut_phases, ddim_times, follow, jump, latent_consistency_end, shares
+from f3amd_lib.text.phases import jump, latent_consistency_end, shares
 from f3amd_lib.text.sampling.motionpcm_sampling import (
     sample_latent_student,
     sample_student,
@@ -30,20 +29,8 @@ from f3amd_lib.text.sampling.motionpcm_sampling import (
     teacher_prediction,
 )
 from f3amd_lib.text.stages import motionpcm_training
-from f3amd_lib.text.stages.motionpcm_training import (
-    DistillationTask,
-    LatentAutoencoderTask,
-    LatentMotionTraining,
-    LatentTable,
-    TeacherTask,
-    clip_error,
-    draw_latent,
-    frame_statistics,
-    latent_table,
-    reconstruction_terms,
-)
 from f3amd_lib.training.checkpoints import network_with
-from f3amd_lib.training.optimise import advance, initial_state, optimise, restore_state, save_state
+from f3amd_lib.training.optimise import advance, initial_state, restore_state, save_state
 
 SCHEDULE = variance_preserving_betas()
 SMALL = {"latent_width": 16, "depth": 3, "num_heads": 2, "hidden_width": 32, "dropout": 0.0}
@@ -57,14 +44,16 @@ def normal(seed, *shape):
 def latents(**changes):
     """Five clips with one caption or two, and the empty one."""
     count = jnp.asarray([1, 2, 1, 2, 1])
-    table = LatentTable(
+    table = motionpcm_training.LatentTable(
         normal(0, 5, 2, 3), jnp.full((5, 2, 3), -20.0), jnp.cumsum(count) - count, count, normal(1, 7, 4), normal(2, 4)
     )
     return table._replace(**changes)
 
 
 def recipe(**settings):
-    return LatentMotionTraining(**{"num_steps": 4, "batch_size": 8, "warmup_steps": 0, "seed": 0, **settings})
+    return motionpcm_training.LatentMotionTraining(
+        **{"num_steps": 4, "batch_size": 8, "warmup_steps": 0, "seed": 0, **settings}
+    )
 
 
 @functools.cache
@@ -74,7 +63,7 @@ def teacher_weights():
 
 def distillation(**settings):
     config = recipe(**{"ema_decay": 0.95, "num_phases": 2, **settings})
-    return DistillationTask(TEACHER, config, latents(), SCHEDULE, teacher_weights())
+    return motionpcm_training.DistillationTask(TEACHER, config, latents(), SCHEDULE, teacher_weights())
 
 
 @functools.cache
@@ -106,7 +95,7 @@ def test_recipes_that_make_no_sense_are_refused():
         with pytest.raises(ValueError, match=message):
             recipe(**settings)
     with pytest.raises(ValueError, match="set ema_decay"):
-        DistillationTask(TEACHER, recipe(), latents(), SCHEDULE, teacher_weights())
+        motionpcm_training.DistillationTask(TEACHER, recipe(), latents(), SCHEDULE, teacher_weights())
 
 
 # --------------------------------------------------------------------------------------------------------- autoencoder
@@ -116,8 +105,8 @@ def test_an_error_is_a_mean_over_numbers_then_frames_then_clips():
     made, mask = jnp.zeros((2, 4, 3)), jnp.arange(4) < jnp.asarray([[4], [1]])
     true = made.at[0].set(2.0).at[1, 0].set(0.5).at[1, 1:].set(1e3)
     # 1.5 and 0.125; padding does not count, and a short clip counts as much as a long one.
-    assert clip_error(made, true, mask) == pytest.approx((1.5 + 0.125) / 2)
-    assert clip_error(made, made, mask) == 0.0
+    assert motionpcm_training.clip_error(made, true, mask) == pytest.approx((1.5 + 0.125) / 2)
+    assert motionpcm_training.clip_error(made, made, mask) == 0.0
 
 
 def test_a_latent_is_drawn_from_its_gaussian_and_diverges_from_the_standard_one():
@@ -135,30 +124,16 @@ def test_a_latent_is_drawn_from_its_gaussian_and_diverges_from_the_standard_one(
 
     statistics = AxisNormaliser(jnp.zeros(23), jnp.full(23, 0.1))
     clips = normal(0, 2, frames, 12 * joints - 1), jnp.ones((2, frames), bool)
-    terms = reconstruction_terms(Coder(), statistics, *clips)
+    terms = motionpcm_training.reconstruction_terms(Coder(), statistics, *clips)
     # KL(N(1, 4) | N(0, 1)) of each number.
     assert float(terms["divergence"]) == pytest.approx(0.5 * (1 + 4 - 1 - np.log(4)), rel=1e-5)
     standard = Coder()
     standard.mean, standard.deviation = 0.0, 1.0
-    assert float(reconstruction_terms(standard, statistics, *clips)["divergence"]) == 0.0
-    drawn = draw_latent(jax.random.key(0), jnp.full(100_000, 1.0), jnp.full(100_000, 2.0 * np.log(2.0)))
-    assert (float(drawn.mean()), float(drawn.std())) == pytest.approx((1.0, 2.0), abs=0.03)
-
-
-@pytest.mark.slow
-def test_an_autoencoder_rehearses_and_hears_of_joints():
-    joints, frames = 2, 12  # 23 numbers a frame
-    clips = ClipTable(
-        normal(3, 3 * frames, 23), jnp.arange(3) * frames, jnp.full(3, frames), jnp.arange(3), jnp.ones(3, jnp.int32)
+    assert float(motionpcm_training.reconstruction_terms(standard, statistics, *clips)["divergence"]) == 0.0
+    drawn = motionpcm_training.draw_latent(
+        jax.random.key(0), jnp.full(100_000, 1.0), jnp.full(100_000, 2.0 * np.log(2.0))
     )
-    config = LatentAutoencoderConfig(**SMALL, window=2, channels=3, features=12 * joints - 1, num_positions=40)
-    statistics = AxisNormaliser(jnp.zeros(23), jnp.full(23, 0.1))
-    settings = recipe(num_frames=16, learning_rate=1e-2, num_steps=60, joints_weight=0.5)
-    task = LatentAutoencoderTask(config, settings, clips, statistics)
-    state, history = optimise(task, chunk=30, progress=False)
-    assert history[1]["features"] < history[0]["features"] and history[1]["joints"] > 0
-    row = history[1]
-    assert row["loss"] == pytest.approx(row["features"] + 0.5 * row["joints"] + 1e-4 * row["divergence"], rel=1e-4)
+    assert (float(drawn.mean()), float(drawn.std())) == pytest.approx((1.0, 2.0), abs=0.03)
 
 
 # ------------------------------------------------------------------------------------------------------------- teacher
@@ -169,7 +144,7 @@ def test_a_clips_captions_are_its_own_and_some_are_the_empty_one():
         mean=jnp.arange(5.0)[:, None, None] * jnp.ones((1, 2, 3)), pooled=jnp.arange(7.0)[:, None].repeat(4, 1)
     )
     marked = marked._replace(empty=jnp.full(4, -1.0))
-    task = TeacherTask(TEACHER, recipe(batch_size=512, text_dropout=0.25), marked, SCHEDULE)
+    task = motionpcm_training.TeacherTask(TEACHER, recipe(batch_size=512, text_dropout=0.25), marked, SCHEDULE)
     (latent, text), _ = task.draw(None, jax.random.key(0))
     owner, caption = (np.rint(np.asarray(column)).astype(int) for column in (latent[:, 0, 0], text[:, 0]))
     assert np.mean(caption == -1) == pytest.approx(0.25, abs=0.06)
@@ -196,7 +171,7 @@ class Looking:
 def test_a_teacher_is_asked_for_the_noise_at_the_level_that_it_is_told(monkeypatch):
     network = Looking()
     monkeypatch.setattr(motionpcm_training, "network_with", lambda config, params: network)
-    task = TeacherTask(TEACHER, recipe(), latents(), SCHEDULE)
+    task = motionpcm_training.TeacherTask(TEACHER, recipe(), latents(), SCHEDULE)
     clean, text = normal(3, 512, 2, 3), normal(4, 512, 4)
     loss, (terms, _) = task.loss({}, None, (clean, text), jax.random.key(2))
     ((state, time, context),) = network.asked
@@ -219,7 +194,7 @@ def test_a_table_has_each_clips_latent_beside_its_captions():
         clips.append((f"clip {number}", motion, tuple(f"{number} {k}" for k in range(said)), split, "walk"))
     data = text_motions(clips, skeleton=motion.skeleton, name="three", fps=20.0, licence="", credit="")
     # Of the training clips alone, however the other one moves.
-    statistics = frame_statistics(data)
+    statistics = motionpcm_training.frame_statistics(data)
     known = np.concatenate([data.select([number]).redundant_vectors() for number in (0, 2)])
     np.testing.assert_allclose(statistics.mean, grouped_statistics(known)[0], atol=1e-6)
     assert np.abs(statistics.mean - grouped_statistics(data.redundant_vectors())[0]).max() > 1e-3
@@ -231,7 +206,7 @@ def test_a_table_has_each_clips_latent_beside_its_captions():
             return (features * mask[..., None]).sum(axis=1, keepdims=True), features[:, :1] + 1.0
 
     pooled, empty = normal(0, 4, 5), normal(1, 5)
-    made = latent_table(Coder(), statistics, data, pooled, empty, num_frames=36, batch=2)
+    made = motionpcm_training.latent_table(Coder(), statistics, data, pooled, empty, num_frames=36, batch=2)
     assert (made.caption.tolist(), made.count.tolist()) == ([0, 1, 3], [1, 2, 1])
     np.testing.assert_array_equal(made.pooled, pooled)
     np.testing.assert_array_equal(made.empty, empty)
@@ -453,64 +428,6 @@ def test_latent_consistency_is_distilled_without_phases():
 
 
 # ----------------------------------------------------------------------------------------------------------------- toy
-
-
-MIXTURE = GaussianMixture([-1.0, 0.6], 0.15, [0.4, 0.6])
-TOY = LatentDenoiserConfig(
-    latent_width=32, depth=3, num_heads=2, hidden_width=64, dropout=0.0, window=1, channels=1, text_width=2,
-    time_features=32, num_positions=3,
-)  # fmt: skip
-
-
-def toy_table():
-    points = jnp.asarray(MIXTURE.sample(np.random.default_rng(0), 4096), jnp.float32)[:, None]
-    ones = jnp.ones(4096, jnp.int32)
-    return LatentTable(points, jnp.full_like(points, -30.0), 0 * ones, ones, jnp.zeros((1, 2)), jnp.zeros(2))
-
-
-def answers(config, params, guidance):
-    network = network_with(config, params)
-    context = lambda z: network.encode(jnp.zeros((len(z), 2)))
-    return lambda z, time: network(z, time, context(z), guidance)
-
-
-@pytest.fixture(scope="module")
-def toys():
-    """By seed: a teacher, and a student of it for each M."""
-    made = {}
-    for seed in range(3):
-        config = LatentMotionTraining(1500, 256, 3e-3, 100, seed=seed, ema_decay=0.99)
-        teacher = optimise(TeacherTask(TOY, config, toy_table(), SCHEDULE), chunk=1500, progress=False)[0].averaged
-        students = {}
-        for num_phases in (1, 2, 4):
-            settings = {"num_phases": num_phases, "adversarial_weight": 0.0, "ema_decay": 0.95, "huber_width": 0.05}
-            config = LatentMotionTraining(1500, 256, 1e-3, 50, seed=seed, **settings)
-            task = DistillationTask(TOY, config, toy_table(), SCHEDULE, teacher)
-            students[num_phases] = optimise(task, chunk=1500, progress=False)[0].params["student"], task.student_config
-        made[seed] = teacher, students
-    return made
-
-
-@pytest.mark.long
-def test_students_learn_where_the_flow_goes(toys):
-    """Over three seeds a student of M steps ends near the exact flow, its teacher in one step does not."""
-    noise = normal(11, 512, 1, 1)
-    alpha, sigma = shares(SCHEDULE, np.array([999, 0]), np)
-    exact = alpha[1] * MIXTURE.flow(np.asarray(noise)[:, 0] / alpha[0], *(sigma / alpha))[:, None]
-    error = lambda made: float(np.mean(np.abs(np.asarray(made) - exact)))
-    rows = []
-    for teacher, students in toys.values():
-        predict = answers(TOY, teacher, None)
-        row = {steps: error(follow(predict, SCHEDULE, noise, ddim_times(1000, steps))) for steps in (1, 10)}
-        for num_phases, (params, config) in students.items():
-            visited = cut_phases(1000, 100, num_phases).visited
-            row[f"M{num_phases}"] = error(follow(answers(config, params, 10.0), SCHEDULE, noise, visited))
-        rows.append(row)
-    table = {name: [row[name] for row in rows] for name in rows[0]}
-    print({name: np.round(values, 3).tolist() for name, values in table.items()})
-    for name in ("M1", "M2", "M4"):
-        assert np.mean(table[name]) < 0.5 * np.mean(table[1]), name
-        assert max(table[name]) < min(table[1]), name
 
 
 # ------------------------------------------------------------------------------------------------------------ sampling

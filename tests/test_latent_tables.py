@@ -56,7 +56,7 @@ def tables(data, tmp_path_factory):
         }
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_rows_have_the_ledgers_columns_steps_arrive_and_real_motion_is_real(tables):
     for name, table in tables.items():
         keys = SCHEMAS[name]

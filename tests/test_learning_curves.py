@@ -105,12 +105,6 @@ def test_a_model_is_trained_in_legs(leg, prepared, tmp_path, caplog, capsys):
     assert files.model.read_bytes() == before
 
 
-def test_an_unknown_preset_stops_before_anything_is_trained(leg, tmp_path, capsys):
-    assert leg("--preset", "F3AMD-FNO-84") == 2
-    assert "unknown model 'F3AMD-FNO-84'; did you mean" in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())
-
-
 def test_the_command_tells_an_unfinished_leg_by_its_status(prepared, monkeypatch, caplog):
     def legs(finished):
         monkeypatch.setattr(pipeline, "finished_model", lambda prepared, profile, name, files: name in finished or None)

@@ -27,17 +27,6 @@ def one(table, update, steps, metric):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("spacing", ["endpoints", "uniform"])
-def test_a_network_that_ignores_its_input_hides_the_missing_factor(model_that, spacing):
-    trained = model_that(lambda x_noisy, sigma: 0.0 * x_noisy + 0.2)
-    table = window_figures(walked(trained, spacing=spacing)[0])
-    for steps in (4, 2):
-        for metric in ("from_rescaled", "seed_spread"):
-            assert one(table, "literal", steps, metric) == pytest.approx(0.0, abs=1e-4)
-    assert one(table, "literal", 4, "from_half_the_steps") == pytest.approx(0.0, abs=1e-4)
-
-
-@pytest.mark.slow
 def test_a_network_that_uses_its_input_shows_it(model_that):
     # The exact denoiser of features that are normal: it keeps the share 1 / (1 + sigma^2).
     trained = model_that(lambda x_noisy, sigma: x_noisy / (1.0 + sigma**2))

@@ -5,7 +5,6 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import pytest
 from builders import SKELETON, wandering_motion
 from compiled import Compiled
@@ -86,35 +85,6 @@ def test_elu_follows_convolutions_alone_and_not_the_decoders_last(linear):
     np.testing.assert_allclose(encode(VERTICES[:1])[0], latent, atol=1e-5)
     x = mean(pooled(u1, elu(convolved(d2, mean(pooled(u2, latent, up2)), a2)), up1))
     np.testing.assert_allclose(decode(latent[None])[0], convolved(d1, x, a1), atol=1e-5)
-
-
-def test_a_mesh_goes_to_its_latent_and_back_and_every_parameter_learns():
-    network = MeshAutoencoder(dataclasses.replace(CONFIG, linear_pooling=True), rngs=nnx.Rngs(0))
-    graph, params = nnx.split(network)
-    encode = nnx.jit(lambda network, vertices: network.encode(vertices, MESH.lists))
-    latent = encode(network, VERTICES)
-    assert latent.shape == (8, 8, 5)
-    # Frames do not mix.
-    np.testing.assert_allclose(encode(network, VERTICES[::-1]), latent[::-1], atol=1e-5)
-
-    @jax.jit
-    def step(params, state):
-        def loss(params):
-            model = nnx.merge(graph, params)
-            return jnp.mean(jnp.abs(model.decode(model.encode(VERTICES, MESH.lists), MESH.lists) - VERTICES))
-
-        value, slope = jax.value_and_grad(loss)(params)
-        update, state = adam.update(slope, state)
-        return optax.apply_updates(params, update), state, value, slope
-
-    adam, losses = optax.adam(1e-2), []
-    state = adam.init(params)
-    for number in range(40):
-        params, state, value, slope = step(params, state)
-        if not number:
-            assert all(bool(jnp.any(leaf != 0)) for leaf in jax.tree.leaves(slope))
-        losses.append(value)
-    assert losses[-1] < 0.3 * losses[0]
 
 
 def test_what_makes_no_sense_is_refused():

@@ -9,21 +9,16 @@ import pytest
 from flax import nnx
 
 from f3amd_lib.networks import presets
-from f3amd_lib.text.networks.autoencoders import (
-    LOG_VARIANCE_RANGE,
-    AutoencoderConfig,
-    MotionAutoencoder,
-    TimeConvolution,
-    smooth_l1,
-    variational_loss,
-)
+from f3amd_lib.text.networks import autoencoders
 
 POSITIONS = jax.random.normal(jax.random.key(0), (2, 32, 3, 3))
 
 
 @functools.cache
 def tiny(**settings):
-    return MotionAutoencoder(AutoencoderConfig(width=8, dilations=(3, 1), **settings), rngs=nnx.Rngs(0))
+    return autoencoders.MotionAutoencoder(
+        autoencoders.AutoencoderConfig(width=8, dilations=(3, 1), **settings), rngs=nnx.Rngs(0)
+    )
 
 
 @nnx.jit
@@ -43,7 +38,7 @@ def encode(model, positions):
 
 def test_sizes_are_those_of_the_released_file():
     config = presets.build_config("ACMDM-causal-AE")
-    model = nnx.eval_shape(lambda: MotionAutoencoder(config, rngs=nnx.Rngs(0)))
+    model = nnx.eval_shape(lambda: autoencoders.MotionAutoencoder(config, rngs=nnx.Rngs(0)))
     count = lambda part: sum(leaf.size for leaf in jax.tree.leaves(nnx.state(part))) / 1e6
     assert count(model) == pytest.approx(17.08, abs=0.005)
     assert (count(model.encoder), count(model.decoder)) == pytest.approx((8.41, 8.67), abs=0.005)
@@ -54,7 +49,7 @@ def test_sizes_are_those_of_the_released_file():
 @pytest.mark.parametrize("causal", [True, False])
 def test_a_matrix_product_of_taps_is_the_convolution(size, stride, dilation, causal):
     options = {"causal": causal, "stride": stride, "dilation": dilation}
-    ours = TimeConvolution(5, 7, size, **options, rngs=nnx.Rngs(0))
+    ours = autoencoders.TimeConvolution(5, 7, size, **options, rngs=nnx.Rngs(0))
     x = jax.random.normal(jax.random.key(1), (2, 16, 5))
     padded = jnp.pad(x, ((0, 0), (ours.before, ours.after), (0, 0)))
     np.testing.assert_allclose(ours(x), ours.layer(padded), atol=1e-5)
@@ -101,7 +96,7 @@ def test_a_variational_latent_is_the_mean_and_its_variance_is_bounded():
     model = tiny(variational=True)
     encoded = encode(model, POSITIONS)
     mean, log_variance = model.moments(1000.0 * encoded)
-    assert mean.shape == (2, 8, 3, 4) and (log_variance.min(), log_variance.max()) == LOG_VARIANCE_RANGE
+    assert mean.shape == (2, 8, 3, 4) and (log_variance.min(), log_variance.max()) == autoencoders.LOG_VARIANCE_RANGE
     np.testing.assert_array_equal(latent(model, POSITIONS), model.moments(encoded)[0])
 
 
@@ -114,14 +109,14 @@ def test_dropout_falls_in_training_alone():
 def test_losses_are_their_formulas():
     x = jnp.zeros((2, 4, 1, 1))
     far = x.at[0].set(0.5).at[1].set(3.0)
-    assert float(smooth_l1(far, x)) == pytest.approx((0.125 + 2.5) / 2)
+    assert float(autoencoders.smooth_l1(far, x)) == pytest.approx((0.125 + 2.5) / 2)
     mask = jnp.asarray([[True] * 4, [False] * 4])
-    assert float(smooth_l1(far, x, mask)) == pytest.approx(0.125)
+    assert float(autoencoders.smooth_l1(far, x, mask)) == pytest.approx(0.125)
     # One sample at a distance of 2 everywhere: s = ln 2 (the soft floor is far away), fit = n (1/2 + ln 2).
-    loss = variational_loss(
+    loss = autoencoders.variational_loss(
         jnp.full((1, 4, 1, 1), 2.0), jnp.zeros((1, 4, 1, 1)), jnp.ones((1, 1, 1, 2)), jnp.zeros((1, 1, 1, 2))
     )
     assert float(loss) == pytest.approx(4 * (0.5 + np.log(2.0)) + 0.01 * 0.5 * 2, abs=1e-2)
-    exact = variational_loss(x, x, jnp.zeros((2, 1, 1, 2)), jnp.zeros((2, 1, 1, 2)))
+    exact = autoencoders.variational_loss(x, x, jnp.zeros((2, 1, 1, 2)), jnp.zeros((2, 1, 1, 2)))
     # Without any error the root is kept at 1e-6, and s softly above -6.
     assert float(exact) == pytest.approx(4 * (-6.0 + np.log1p(1e-6 * np.exp(6.0))), abs=1e-5)

@@ -11,34 +11,26 @@ from compiled import Compiled
 from flax import nnx
 
 from f3amd_lib.networks import presets
-from f3amd_lib.text.networks.motionpcm import (
-    Discriminator,
-    DiscriminatorConfig,
-    LatentAutoencoder,
-    LatentAutoencoderConfig,
-    LatentDenoiser,
-    LatentDenoiserConfig,
-    SkipTransformer,
-    SkipTransformerConfig,
-    span_shares,
-    student_of,
-    waves,
-)
+from f3amd_lib.text.networks import motionpcm
 
 SMALL = {"window": 4, "channels": 3, "latent_width": 16, "depth": 1, "num_heads": 2, "hidden_width": 32}
 
 
 @pytest.fixture(scope="module")
 def teacher():
-    return Compiled(LatentDenoiser(LatentDenoiserConfig(**SMALL, text_width=5, time_features=12), rngs=nnx.Rngs(0)))
+    return Compiled(
+        motionpcm.LatentDenoiser(
+            motionpcm.LatentDenoiserConfig(**SMALL, text_width=5, time_features=12), rngs=nnx.Rngs(0)
+        )
+    )
 
 
 @pytest.fixture(scope="module")
 def coders():
     """An autoencoder for each path between frames and tokens."""
-    config, rngs = LatentAutoencoderConfig(**SMALL, features=7, num_positions=40), nnx.Rngs(0)
+    config, rngs = motionpcm.LatentAutoencoderConfig(**SMALL, features=7, num_positions=40), nnx.Rngs(0)
     return {
-        path: Compiled(LatentAutoencoder(dataclasses.replace(config, path=path), rngs=rngs))
+        path: Compiled(motionpcm.LatentAutoencoder(dataclasses.replace(config, path=path), rngs=rngs))
         for path in ("attention", "spans")
     }
 
@@ -62,9 +54,12 @@ def numbers(module):
 
 def test_sizes_are_the_papers():
     blank = lambda make: nnx.eval_shape(lambda: make(nnx.Rngs(0)))
-    config = SkipTransformerConfig()
-    assert round(numbers(blank(lambda rngs: SkipTransformer(config, rngs=rngs))) / 1e6, 2) == 7.63
-    assert round(numbers(blank(lambda rngs: SkipTransformer(config, crossing=True, rngs=rngs))) / 1e6, 2) == 10.01
+    config = motionpcm.SkipTransformerConfig()
+    assert round(numbers(blank(lambda rngs: motionpcm.SkipTransformer(config, rngs=rngs))) / 1e6, 2) == 7.63
+    assert (
+        round(numbers(blank(lambda rngs: motionpcm.SkipTransformer(config, crossing=True, rngs=rngs))) / 1e6, 2)
+        == 10.01
+    )
     teacher, student = (
         presets.count_parameters(presets.build_config(f"MotionPCM-{name}")) for name in ("teacher", "M1")
     )
@@ -80,7 +75,7 @@ def test_presets_name_every_row_of_the_paper_and_survive_json():
         assert presets.config_from_dict(config.to_dict()) == config
     assert {preset.latent for preset in found.values()} <= {"", *found}
     with pytest.raises(ValueError, match="depth must be odd"):
-        SkipTransformerConfig(depth=4)
+        motionpcm.SkipTransformerConfig(depth=4)
 
 
 # --------------------------------------------------------------------------------------------------------- autoencoder
@@ -107,7 +102,7 @@ def test_a_latent_has_one_size_and_padding_changes_nothing(coders, path):
 
 
 def test_a_frame_belongs_to_the_spans_about_it():
-    shares = np.asarray(span_shares(jnp.arange(6) < jnp.asarray([[6], [4]]), 2))
+    shares = np.asarray(motionpcm.span_shares(jnp.arange(6) < jnp.asarray([[6], [4]]), 2))
     # Middles of the spans are at frames 1 and 4 of six, at 0.5 and 2.5 of four.
     np.testing.assert_allclose(shares[0, :, 1], [0, 0, 1 / 3, 2 / 3, 1, 1], atol=1e-6)
     np.testing.assert_allclose(shares[1, :, 1], [0, 0.25, 0.75, 1, 0, 0], atol=1e-6)
@@ -129,8 +124,8 @@ def test_with_spans_each_token_begins_with_its_own_frames(coders):
 
 
 def test_the_second_half_is_handed_the_first_in_reverse():
-    config = SkipTransformerConfig(**{**SMALL, "depth": 5})
-    body = SkipTransformer(config, rngs=nnx.Rngs(1))
+    config = motionpcm.SkipTransformerConfig(**{**SMALL, "depth": 5})
+    body = motionpcm.SkipTransformer(config, rngs=nnx.Rngs(1))
     outputs = nnx.jit(lambda body, z: list(body.outputs(z)))(body, normal(0, 1, 4, 16))
     assert len(outputs) == 5
     joined = lambda number, kept, z: body.blocks[number](body.joins[number - 3](jnp.concatenate([z, kept], -1)))
@@ -143,15 +138,15 @@ def test_the_second_half_is_handed_the_first_in_reverse():
 
 
 def test_waves_are_those_of_the_released_code():
-    np.testing.assert_allclose(waves(3.0, 4, 2.0), [*np.cos([3.0, 0.03]), *np.sin([3.0, 0.03])], rtol=1e-5)
-    told = waves(3.0, 4, 1.0, sine_first=True)
+    np.testing.assert_allclose(motionpcm.waves(3.0, 4, 2.0), [*np.cos([3.0, 0.03]), *np.sin([3.0, 0.03])], rtol=1e-5)
+    told = motionpcm.waves(3.0, 4, 1.0, sine_first=True)
     np.testing.assert_allclose(told, [*np.sin([3.0, 3e-4]), *np.cos([3.0, 3e-4])], rtol=1e-5)
 
 
 def test_a_student_is_its_teacher_at_first_whatever_it_is_told(teacher):
     state, context = normal(1, 3, 4, 3), teacher.encode(normal(2, 3, 5))
     time, told = jnp.asarray([999, 499, 99]), jnp.asarray([0.0, 5.0, 15.0])
-    student, answer = Compiled(student_of(teacher.network, jax.random.key(9))), teacher(state, time, context)
+    student, answer = Compiled(motionpcm.student_of(teacher.network, jax.random.key(9))), teacher(state, time, context)
     np.testing.assert_array_equal(student(state, time, context, told), answer)
     student.guidance.kernel[...] = 0.1 * normal(3, *student.guidance.kernel.shape)
     moved = student(state, time, context, told)
@@ -164,13 +159,13 @@ def test_a_student_is_its_teacher_at_first_whatever_it_is_told(teacher):
 
 def test_guidance_joins_the_waves_of_the_time_before_their_layers(teacher):
     """Waves of 1,000 w, sines first, last frequency 1/10,000, by a layer without bias (MotionLCM's released code)."""
-    student = student_of(teacher.network, jax.random.key(9))
+    student = motionpcm.student_of(teacher.network, jax.random.key(9))
     kernel = 0.1 * normal(3, 256, 12)
     student.guidance.kernel[...] = kernel
     w, time = 7.25, 499
     angle = 1000.0 * w * 10000.0 ** (-np.arange(128) / 127.0)
     told = np.r_[np.sin(angle), np.cos(angle)]
-    of_time = np.asarray(waves(time, 12, 6.0)) + told @ np.asarray(kernel)
+    of_time = np.asarray(motionpcm.waves(time, 12, 6.0)) + told @ np.asarray(kernel)
     wanted = student.time_second(jax.nn.silu(student.time_first(jnp.asarray(of_time, jnp.float32))))
     asked = normal(1, 1, 4, 3), jnp.asarray([time]), student.encode(normal(2, 1, 5)), jnp.asarray([w])
     found = student._tokens(*asked)[0, 4] - student.positions[...][4]  # after the four tokens of the latent
@@ -193,9 +188,11 @@ def test_each_input_moves_the_answer(teacher, change):
 
 
 def test_a_discriminator_reads_every_block_and_lets_the_gradient_through():
-    config = LatentDenoiserConfig(**{**SMALL, "depth": 3}, text_width=5, time_features=12)
-    teacher = Compiled(LatentDenoiser(config, rngs=nnx.Rngs(0)))
-    critic = Compiled(Discriminator(DiscriminatorConfig(latent_width=16, depth=3, heads=2), rngs=nnx.Rngs(4)))
+    config = motionpcm.LatentDenoiserConfig(**{**SMALL, "depth": 3}, text_width=5, time_features=12)
+    teacher = Compiled(motionpcm.LatentDenoiser(config, rngs=nnx.Rngs(0)))
+    critic = Compiled(
+        motionpcm.Discriminator(motionpcm.DiscriminatorConfig(latent_width=16, depth=3, heads=2), rngs=nnx.Rngs(4))
+    )
     context = teacher.encode(normal(2, 2, 5))
     scores = lambda state: critic(teacher.features(state, jnp.asarray([199, 499]), context))
     state = normal(1, 2, 4, 3)

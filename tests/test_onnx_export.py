@@ -11,14 +11,7 @@ import numpy as np
 import pytest
 from builders import refused
 
-from f3amd_companion.serving.onnx_export import (
-    PROGRAM,
-    OnnxProgram,
-    denoiser_program,
-    export_onnx,
-    largest_difference,
-    seeded_inputs,
-)
+from f3amd_companion.serving import onnx_export
 from f3amd_lib.diffusion.samplers import walk
 from f3amd_lib.diffusion.schedules import variance_preserving_cosine
 from f3amd_lib.networks.conditioning import Condition
@@ -38,14 +31,14 @@ def trained():
 
 @pytest.fixture(scope="module")
 def folder(trained, tmp_path_factory):
-    return export_onnx(trained, tmp_path_factory.mktemp("onnx") / "tiny", num_steps=2)
+    return onnx_export.export_onnx(trained, tmp_path_factory.mktemp("onnx") / "tiny", num_steps=2)
 
 
 def whole_walks(program, trained, num_steps, batch):
     """The same round by ONNX Runtime and by JAX, [B, T, C] each, of the same noise."""
     network, schedule = trained.network(), trained.diffusion
-    noise, _, *given = seeded_inputs(trained.config, batch).values()
-    run, condition = OnnxProgram(program), Condition(*given)
+    noise, _, *given = onnx_export.seeded_inputs(trained.config, batch).values()
+    run, condition = onnx_export.OnnxProgram(program), Condition(*given)
     sigmas, key = schedule.grid(num_steps), jax.random.key(7)
     if schedule.sampler == "ddpm":  # draws at each step: the same keys, and then the same start
         key_steps = jax.random.split(key)[1]
@@ -64,15 +57,15 @@ def whole_walks(program, trained, num_steps, batch):
 @pytest.mark.parametrize("batch", (1, 3))
 @pytest.mark.parametrize("num_steps", (1, 8))
 def test_a_round_agrees_with_jax_for_any_number_of_characters(folder, trained, num_steps, batch):
-    found, wanted = whole_walks((folder / PROGRAM).read_bytes(), trained, num_steps, batch)
+    found, wanted = whole_walks((folder / onnx_export.PROGRAM).read_bytes(), trained, num_steps, batch)
     np.testing.assert_allclose(found, wanted, atol=1e-4)
 
 
 @needs_onnx
 def test_other_weights_or_another_condition_would_be_seen(folder, trained):
-    run, network = OnnxProgram((folder / PROGRAM).read_bytes()), trained.network()
+    run, network = onnx_export.OnnxProgram((folder / onnx_export.PROGRAM).read_bytes()), trained.network()
     level = np.array([1.0, 3.0], np.float32)  # one a character
-    inputs = seeded_inputs(trained.config, 2) | {"sigma": level}
+    inputs = onnx_export.seeded_inputs(trained.config, 2) | {"sigma": level}
     found, condition = run(**inputs), Condition(*list(inputs.values())[2:])
     np.testing.assert_allclose(found, builders.evaluate(network, inputs["x_noisy"], level, condition), atol=1e-5)
     for name, least in {"sigma": 1e-3, "history": 1e-4, "path": 1e-4, "style": 1e-4}.items():
@@ -92,11 +85,11 @@ def test_the_worked_example_runs_beside_the_files_alone(folder):
 @needs_onnx
 def test_fewer_bits_are_smaller_and_cost_what_is_measured(folder, trained):
     network, sigmas = trained.network(), trained.diffusion.grid(4)[:-1]
-    sizes, errors = [(folder / PROGRAM).stat().st_size], [0.0]
+    sizes, errors = [(folder / onnx_export.PROGRAM).stat().st_size], [0.0]
     for weights in ("float16", "int8"):
-        program = denoiser_program(network, weights=weights)
+        program = onnx_export.denoiser_program(network, weights=weights)
         sizes.append(len(program))
-        errors.append(largest_difference(program, network, sigmas))
+        errors.append(onnx_export.largest_difference(program, network, sigmas))
     assert sizes[0] > sizes[1] > sizes[2]
     assert 1e-6 < errors[1] < errors[2] < 0.1
 
@@ -104,12 +97,12 @@ def test_fewer_bits_are_smaller_and_cost_what_is_measured(folder, trained):
 @needs_onnx
 def test_what_cannot_be_exported_is_told(trained, folder, monkeypatch):
     network = trained.network()
-    refused("unknown weights 'int4'", denoiser_program, network, weights="int4")
-    refused("at least 1 character", denoiser_program, network, batch=0)
-    refused("pass --overwrite", export_onnx, trained, folder)
+    refused("unknown weights 'int4'", onnx_export.denoiser_program, network, weights="int4")
+    refused("at least 1 character", onnx_export.denoiser_program, network, batch=0)
+    refused("pass --overwrite", onnx_export.export_onnx, trained, folder)
     monkeypatch.setitem(sys.modules, "jax2onnx", None)
     with pytest.raises(ImportError, match="make onnx-tools"):
-        denoiser_program(network)
+        onnx_export.denoiser_program(network)
 
 
 @needs_onnx
@@ -117,7 +110,7 @@ def test_what_cannot_be_exported_is_told(trained, folder, monkeypatch):
 @pytest.mark.parametrize("name", SHIPPED)
 def test_every_shipped_model_agrees_with_jax(name):
     trained = load_model(PRETRAINED / name)
-    program = denoiser_program(trained.network())
+    program = onnx_export.denoiser_program(trained.network())
     for num_steps in (8, 1):
         found, wanted = whole_walks(program, trained, num_steps, 2)
         np.testing.assert_allclose(found, wanted, atol=1e-4, err_msg=f"{name}, {num_steps} steps")
@@ -126,5 +119,5 @@ def test_every_shipped_model_agrees_with_jax(name):
 @needs_onnx
 def test_camdm_walks_with_fresh_noise():
     trained = builders.tiny_trained(config=builders.tiny_camdm(), diffusion=variance_preserving_cosine(4))
-    found, wanted = whole_walks(denoiser_program(trained.network()), trained, 4, 2)
+    found, wanted = whole_walks(onnx_export.denoiser_program(trained.network()), trained, 4, 2)
     np.testing.assert_allclose(found, wanted, atol=1e-4)

@@ -115,12 +115,6 @@ def test_without_an_average_the_weights_are_what_is_evaluated(finished):
     assert same_tree(state.params, finished[0].params)
 
 
-def test_a_given_state_stays_alive():
-    state = initial_state(line())
-    optimise(line(), state, stop_after=4, **QUIET)
-    assert same_tree(state, initial_state(line()))
-
-
 class Killed(Exception):
     pass
 
@@ -195,18 +189,6 @@ def test_an_infinite_update_is_found_and_never_reaches_the_checkpoint(tmp_path, 
     assert int(state.step) == 2 and all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(state.params))
 
 
-def test_checkpoints_are_written_though_chunks_end_elsewhere(tmp_path):
-    checkpoint, steps = tmp_path / "state.safetensors", []
-
-    def look(row):
-        steps.append(int(restore_state(checkpoint, line()).step) if checkpoint.exists() else 0)
-
-    optimise(line(), checkpoint=checkpoint, checkpoint_every=3, stop_after=6, on_chunk=look, **QUIET)
-    look({})
-    # Three steps are done for the first time when the second chunk ends; a row is told before its state is written.
-    assert steps == [0, 0, 4, 6]
-
-
 def test_held_out_loss_is_measured_on_the_same_noise_every_time(finished):
     held_out = line().points[::3]
     first = held_out_terms(line(), finished[0], held_out)
@@ -217,38 +199,3 @@ def test_held_out_loss_is_measured_on_the_same_noise_every_time(finished):
 
 
 # ------------------------------------------------------------------------------- several players
-
-
-@functools.partial(jax.tree_util.register_dataclass, data_fields=("points",), meta_fields=("config",))
-@dataclass(frozen=True, eq=False)
-class Lesson(Line):
-    """A pupil learns from a frozen teacher, and a judge learns how far the two are apart."""
-
-    name: ClassVar[str] = "lesson"
-
-    @property
-    def optimiser(self):
-        players = {"pupil": optax.adam(3e-2), "judge": optax.sgd(1e-1), "teacher": optax.set_to_zero()}
-        return optax.partition(players, {player: player for player in players})
-
-    def init(self, key):
-        return {"pupil": jnp.zeros(()), "judge": jnp.zeros(()), "teacher": jnp.asarray(2.0)}, None
-
-    def loss(self, params, statistics, batch, key):
-        gap = jnp.abs(params["teacher"] - params["pupil"])
-        terms = {"lesson": gap**2, "judgement": (params["judge"] - jax.lax.stop_gradient(gap)) ** 2}
-        terms = {"loss": terms["lesson"] + terms["judgement"], **terms}
-        return terms["loss"], (terms, statistics)
-
-
-def test_several_players_train_together_and_resume(tmp_path):
-    lesson, checkpoint = Lesson(line().points, LineConfig(num_steps=400)), tmp_path / "state.safetensors"
-    whole, _ = optimise(lesson, progress=False, chunk=20)
-    assert {name: float(value) for name, value in whole.params.items()} == pytest.approx(
-        {"teacher": 2.0, "pupil": 2.0, "judge": 0.0}, abs=0.02
-    )
-    early, _ = optimise(lesson, checkpoint=checkpoint, stop_after=20, progress=False, chunk=20)
-    # The judge saw the gap shrink, and no gradient of its own loss helped the pupil.
-    assert 1.0 < float(early.params["judge"]) < 2.0 and 0.3 < float(early.params["pupil"]) < 0.8
-    resumed, _ = optimise(lesson, checkpoint=checkpoint, progress=False, chunk=20)
-    assert same_tree(resumed, whole)

@@ -13,7 +13,7 @@ from f3amd_lib.motion.bvh import format_bvh
 from f3amd_lib.motion.rotations import matrix_from_euler
 from f3amd_lib.motion.skeleton import Motion, Skeleton, resample
 
-pytestmark = pytest.mark.needs("node")
+pytestmark = pytest.mark.wants("node")
 SCRIPT = """
 import { readBvh } from "./bvh.mjs";
 import { readFileSync, readdirSync } from "node:fs";

@@ -122,7 +122,7 @@ def reproduce(reader, paper, table, *more):
 
 
 @pytest.mark.slow
-@pytest.mark.needs("wordllama", "tokenizers")
+@pytest.mark.wants("wordllama", "tokenizers")
 @pytest.mark.parametrize(
     ("paper", "table", "record", "measured"),
     [
@@ -155,7 +155,7 @@ def test_from_a_folder_to_the_papers_table(reader, paper, table, record, measure
 
 
 @pytest.mark.slow
-@pytest.mark.needs("wordllama", "tokenizers")
+@pytest.mark.wants("wordllama", "tokenizers")
 def test_crops_are_as_released_and_what_is_missing_is_said(reader, cache_dir, caplog):
     data = humanml3d.read_humanml3d(reader / "HumanML3D")
     test = data.select(data.members("test"))

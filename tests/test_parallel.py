@@ -79,14 +79,6 @@ def test_two_devices_end_with_the_weights_of_one(tmp_path, alone):
     assert loss == pytest.approx(held_out, abs=1e-4)
 
 
-@pytest.mark.slow
-def test_a_mesh_of_one_device_changes_no_number(alone):
-    mesh = all_devices()
-    state, _ = optimise(task(), chunk=3, mesh=mesh, progress=False)
-    for ours, theirs in zip(alone[0], weights_of(state.ema), strict=True):
-        np.testing.assert_allclose(theirs, ours, atol=1e-6)
-
-
 def test_what_lies_on_all_devices_is_a_copy_and_may_hold_what_is_no_number():
     mesh = all_devices()
     mine = jax.numpy.array([1.0, np.nan])

@@ -24,7 +24,7 @@ def moving(html: str) -> tuple[Image.Image, dict]:
 
 
 def test_the_path_is_short_begins_with_motion_and_has_every_equation_in_text_and_code():
-    notebook = nbformat.read(PATH, as_version=4)
+    notebook = nbformat.v4.reads(PATH.read_text("utf-8"))
     outputs = [output.get("data", {}) for cell in notebook.cells for output in cell.get("outputs", ())]
     shown = [data for data in outputs if "image/png" in data or "<img " in data.get("text/html", "")]
     assert len(" ".join(prose(notebook)).split()) <= MOST_WORDS and len(shown) <= MOST_PICTURES
@@ -39,7 +39,7 @@ def test_the_path_is_short_begins_with_motion_and_has_every_equation_in_text_and
 
 @pytest.mark.parametrize("path", [*NOTEBOOKS[1:], *COURSE, *STANDALONE], ids=lambda path: path.stem)
 def test_every_other_notebook_says_whether_to_read_it_or_look_it_up_and_for_how_long(path):
-    line = nbformat.read(path, as_version=4).cells[0].source.splitlines()[1]
+    line = nbformat.v4.reads(path.read_text("utf-8")).cells[0].source.splitlines()[1]
     assert re.fullmatch(r"\*(Read, after|Look up).*: .+ \d+ minutes of text, .+ to run\.\*", line), line
 
 

@@ -12,7 +12,6 @@ from f3amd_lib.text.phases import (
     consistency_scales,
     cut_phases,
     ddim_times,
-    follow,
     guided_noise,
     hinge,
     jump,
@@ -30,9 +29,6 @@ def normal(seed, *shape):
     return jax.random.normal(jax.random.key(seed), shape)
 
 
-# --------------------------------------------------------------------------------------------------------------- phases
-
-
 def test_alpha_bars_are_the_published_schedules():
     alpha_bar = SCHEDULE.alpha_bars[[0, 99, 199, 299, 399, 499, 599, 699, 799, 899, 999]]
     wanted = "999150 895463 755238 592183 426086 277670 161753 083128 037195 014299 004660".split()
@@ -40,6 +36,9 @@ def test_alpha_bars_are_the_published_schedules():
     alpha, sigma = shares(SCHEDULE, np.array([0, 499, 999]), np)
     np.testing.assert_allclose(alpha, [0.99957, 0.52694, 0.06826], atol=6e-6)
     np.testing.assert_allclose(sigma, [0.02915, 0.84990, 0.99767], atol=6e-6)
+
+
+# --------------------------------------------------------------------------------------------------------------- phases
 
 
 @pytest.mark.parametrize(
@@ -99,25 +98,6 @@ def test_motionpcm_eq15_to_eq19_the_integral_of_a_jump_leads_where_ddim_does():
 def perturbed(x0, eps, time):
     alpha, sigma = (share.reshape(-1, 1, 1) for share in shares(SCHEDULE, time))
     return alpha * x0 + sigma * eps
-
-
-def gaussian_noise(state, time, mean=0.3, variance=0.6):
-    """The exact noise estimate of one Gaussian, numpy."""
-    alpha, sigma = shares(SCHEDULE, time, np)
-    return sigma * (state - alpha * mean) / (alpha**2 * variance + sigma**2)
-
-
-@pytest.mark.parametrize("skip, wanted", [(100, 1.4150), (20, 1.5600)])
-def test_jumps_through_a_gaussian_end_where_the_sheet_says(skip, wanted):
-    phases, state = cut_phases(1000, skip), np.asarray(1.7)
-    for time, before in zip(phases.times[::-1], phases.before[::-1], strict=True):
-        state = jump(SCHEDULE, state, gaussian_noise(state, time), time, before)
-    assert state == pytest.approx(wanted, abs=6e-5)
-    # The exact flow keeps the quantile: 1.6024.
-    spread = lambda t: np.sqrt(SCHEDULE.alpha_bars[t] * 0.6 + 1 - SCHEDULE.alpha_bars[t])
-    alpha = np.sqrt(SCHEDULE.alpha_bars)
-    exact = alpha[0] * 0.3 + (1.7 - alpha[999] * 0.3) * spread(0) / spread(999)
-    assert exact == pytest.approx(1.6024, abs=5e-5) and abs(state - exact) > 1e-3
 
 
 def test_motionpcm_eq11_no_guidance_is_the_condition_alone_and_noise_and_estimate_agree():
@@ -236,19 +216,6 @@ def test_a_perfect_student_walks_the_oracles_flow_from_edge_to_edge(num_phases):
     # The teacher's own estimate, jumping as far, does not.
     naive = jump(SCHEDULE, jnp.asarray(noise, jnp.float32), exact_noise(jnp.asarray(noise, jnp.float32), 999), 999, 0)
     assert np.abs(naive - exact_flow(noise, 999, 0)).mean() > 0.3
-
-
-def test_a_walk_is_its_jumps_and_draws_no_noise():
-    noise, times = normal(3, 64, 1), ddim_times(1000, 20)
-    made = follow(exact_noise, SCHEDULE, noise, times)
-    state = noise
-    for time, time_next in zip(times[:-1], times[1:], strict=True):
-        state = jump(SCHEDULE, state, exact_noise(state, time), time, time_next)
-    np.testing.assert_allclose(made, state, atol=2e-5)
-    # More steps come nearer to the flow.
-    error = lambda steps: np.abs(follow(exact_noise, SCHEDULE, noise, ddim_times(1000, steps)) - exact).mean()
-    exact = exact_flow(noise, 999, 0)
-    assert error(50) < error(10) < error(2) and error(50) < 0.05
 
 
 def test_a_perfect_target_answers_with_the_end_of_the_path_and_a_mean_does_not():

@@ -1,18 +1,16 @@
 """Where the camera puts things, what covers what, and that colours tell rows apart."""
 
-import dataclasses
 import hashlib
 
 import numpy as np
 from builders import stiff_walk, wandering_motion
-from f3amd_notebooks.drawings import poses_beside
 from matplotlib.collections import LineCollection
 from matplotlib.colors import to_hex
 
 from f3amd_lib.drawing.pictures import crowd_figure, film_strip
-from f3amd_lib.drawing.stick_figures import LIMB_COLORS, Camera, drawn_points
+from f3amd_lib.drawing.stick_figures import LIMB_COLORS, Camera
 from f3amd_lib.drawing.style import keep_figure, new_figure
-from f3amd_lib.motion.skeleton import Motion, turn
+from f3amd_lib.motion.skeleton import turn
 
 # --- the camera --------------------------------------------------------------------------------
 
@@ -66,16 +64,6 @@ def test_a_crowd_is_shown_whole():
 
 
 # --- diagrams ----------------------------------------------------------------------------------
-
-
-def test_motion_of_positions_alone_is_drawn_without_its_tips():
-    whole = wandering_motion(4)
-    tipped = whole.replace(skeleton=dataclasses.replace(whole.skeleton, end_sites=((3, (0.0, 0.0, 0.1)),)))
-    alone = Motion.from_positions(tipped.skeleton, whole.positions)
-    frames = np.arange(2)
-    assert drawn_points(tipped, frames).shape[1] == whole.skeleton.num_joints + 1
-    np.testing.assert_allclose(drawn_points(alone, frames), whole.positions[:2])
-    poses_beside({"alone": alone}, frames)
 
 
 def test_a_kept_figure_names_its_data_set_and_its_light_copy_the_file_in_full_size(tmp_path):

@@ -2,16 +2,12 @@
 
 import dataclasses
 
-import numpy as np
 import pytest
 
 import f3amd_lib.training.pipeline as pipeline
-from f3amd_companion.__main__ import main
-from f3amd_lib.data.features import world_frames
 from f3amd_lib.data.packed import CACHE_DIR_VARIABLE
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import read_table
-from f3amd_lib.motion.bvh import read_bvh
 
 
 @pytest.fixture(scope="module")
@@ -117,22 +113,3 @@ def test_shipped_weights_never_cross_to_another_skeleton(trained_once, same_runs
     monkeypatch.setattr(pipeline, "train", lambda *args, **kwargs: (None, None))
     *_, origin = pipeline.obtain_model(prepared, laptop, progress=False)
     assert origin == "trained now"
-
-
-@pytest.mark.slow
-def test_command_writes_motion_that_reads_back(trained_once, same_runs, tmp_path, capsys):
-    _, _, profile, model = trained_once
-    weights = pipeline.model_files(profile).model
-    command = ["rollout", "--style", model.styles[0], "--path", "circle", "--seconds", "1.5"]
-    command += ["--steps", "1", "--weights", str(weights), "--out", str(tmp_path), "--format", "bvh,gif"]
-    assert main(command) == 0
-    stem = tmp_path / f"{model.styles[0]}_circle_seed0"
-    motion = read_bvh(stem.with_suffix(".bvh"))
-    assert motion.num_frames == 45
-    assert motion.skeleton.names == model.skeleton.names
-    assert np.isfinite(world_frames(motion)).all()
-    assert stem.with_suffix(".png").stat().st_size > 1000
-    assert stem.with_suffix(".gif").read_bytes()[:4] == b"GIF8"
-    assert main(command) == 2
-    assert "exists already" in capsys.readouterr().err
-    assert main([*command, "--overwrite"]) == 0

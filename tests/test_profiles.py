@@ -28,28 +28,16 @@ def test_data_sets_are_those_that_can_be_opened():
     assert profiles.DATASETS == sources.NAMES
 
 
-def test_gpu_is_the_papers_scale():
-    profile = load_profile("gpu", "100style")
-    assert profile.preset == "F3AMD-FNO-96"
-    assert profile.batch_size == 512
-    assert profile.learning_rate == 5e-4
-    assert (profile.num_history, profile.window, profile.rollout_rounds) == (10, 32, 80)
-    assert profile.window * profile.rollout_rounds == 2560
-
-
 @pytest.mark.parametrize(
     "key, value, complaint",
     [
         ("num_steps", True, "num_steps must be a whole number, got True"),
-        ("num_steps", 8.0, "num_steps must be a whole number, got 8.0"),
-        ("num_steps", None, "num_steps must be a whole number, got None"),
         ("num_steps", 0, "num_steps must be above 0"),
         ("num_styles", "all", "num_styles must be a whole number or None"),
         ("seconds_per_style", float("nan"), "seconds_per_style must be a finite number"),
         ("seed", -1, "seed must be a whole number from 0"),
         ("preset", 96, "preset must be a name"),
         ("evaluation_styles", "proud", "evaluation_styles must be a list"),
-        ("evaluation_styles", [1], "each of evaluation_styles must be a name"),
     ],
 )
 def test_wrong_values_are_refused(key, value, complaint):

@@ -10,14 +10,8 @@ from flax import nnx
 from safetensors.numpy import save_file
 from scipy.special import erf
 
-from f3amd_lib.data.features import path_condition, split_frames
-from f3amd_lib.data.packed import packed_dataset
-from f3amd_lib.data.sources import open_dataset
-from f3amd_lib.motion.root_paths import named_path
-from f3amd_lib.motion.rotations import matrix_from_rotation_6d, matrix_from_yaw, rotation_6d_from_matrix
 from f3amd_lib.networks.conditioning import Condition
-from f3amd_lib.rollout.rollout import MotionGenerator
-from f3amd_lib.text.released import ReleasedFeatures, read_released, released_arrays
+from f3amd_lib.text.released import read_released, released_arrays
 
 HEADS = 4
 
@@ -137,39 +131,6 @@ def test_it_computes_what_the_released_forward_pass_computes(step, tmp_path):
     x_noisy = (x * np.sqrt(1.0 + sigma**2))[None].astype(np.float32)
     found = evaluate(network, x_noisy, np.float32(sigma), condition)[0]
     np.testing.assert_allclose(found, by_hand(arrays, x, step, past, trans, pose, 3), atol=2e-4)
-
-
-def test_frames_and_paths_are_turned_into_rows_and_back():
-    rng = np.random.default_rng(0)
-    turned = matrix_from_rotation_6d(rng.normal(size=(4, 3, 6)))
-    root = rng.normal(size=(4, 3))
-    frames = np.concatenate([root, np.asarray(rotation_6d_from_matrix(turned)).reshape(4, -1)], axis=-1)
-    features = ReleasedFeatures()
-    x = np.asarray(features.normalise(frames))
-    np.testing.assert_allclose(x[:, :6], turned[:, 0, :2].reshape(4, 6), atol=1e-6)
-    np.testing.assert_allclose(x[:, -6:], np.concatenate([root, 0 * root], axis=-1), atol=1e-6)
-    np.testing.assert_allclose(features.denormalise(x), frames, atol=1e-6)
-    yaw = np.array([0.3, -2.0])
-    path = np.asarray(features.normalise_path(path_condition(np.ones((2, 2)), yaw)))
-    np.testing.assert_allclose(path[:, 2:], matrix_from_yaw(yaw)[:, :2].reshape(2, 6), atol=1e-6)
-
-
-@pytest.fixture(scope="module")
-def packed():
-    return packed_dataset(open_dataset("synthetic", seconds_per_style=5.0, num_styles=2))
-
-
-def test_a_published_network_walks_on_the_data_it_knows(packed, tmp_path):
-    arrays = released(packed.skeleton.num_joints, len(packed.styles), width=16, depth=1, hidden=32)
-    save_file(arrays, tmp_path / "camdm.safetensors")
-    trained = read_released(tmp_path / "camdm.safetensors", "camdm", packed=packed)
-    path = named_path("straight", 90, speed=1.0)
-    made = MotionGenerator(trained, 4).rollout(path, packed.styles[1])
-    assert made.frames.shape == (1, 90, split_frames(made.frames)[1].shape[-2] * 6 + 3)
-    assert np.isfinite(made.motion().positions).all()
-    with pytest.raises(ValueError, match="25 joints in 100 styles"):
-        save_file(released(width=16, depth=1, hidden=32), tmp_path / "other.safetensors")
-        read_released(tmp_path / "other.safetensors", "camdm", packed=packed)
 
 
 def test_a_file_that_is_damaged_or_missing_is_refused_by_name(tmp_path):

@@ -63,12 +63,6 @@ def test_a_bad_figure_misses_its_bar_and_no_other(metric, value, bar):
     assert found[bar] == "neither"
 
 
-def test_bars_name_the_model_that_meets_them():
-    frame = table()
-    frame.loc[(frame["model"] == BAR_MODELS[0]) & (frame["metric"] == "IRD_excess"), "value"] = 9.0
-    assert met_by(quality_bars(frame, 0.9))["IRD excess"] == BAR_MODELS[1]
-
-
 def test_what_was_not_measured_is_said():
     bars = met_by(quality_bars(table(), 0.5))
     assert bars["Classifier, held-out accuracy"] == "neither"

@@ -3,10 +3,9 @@
 import dataclasses
 
 import pytest
-from builders import HISTORY, WINDOW, packed_from, tiny_camdm, tiny_trained, wandering_motion
+from builders import HISTORY, WINDOW, packed_from, tiny_trained, wandering_motion
 
 from f3amd_companion.measuring import campaign, measure
-from f3amd_lib.diffusion.schedules import variance_preserving_cosine
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.networks import presets
@@ -48,31 +47,6 @@ def test_every_recipe_changes_one_thing(prepared):
     assert plus.own_history_share == presets.find_preset("F3AMD-FNO-96-plus").training[
         "own_history_share"
     ]  # fmt: skip
-
-
-@pytest.mark.slow
-def test_noise_use_asks_every_model_at_its_own_levels(prepared, tmp_path, monkeypatch):
-    monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path))
-    models = {
-        "F3AMD-FNO-32": tiny_trained(),
-        "CAMDM": tiny_trained(config=tiny_camdm(), diffusion=variance_preserving_cosine(4)),
-    }
-    monkeypatch.setattr(measure, "obtain_model", lambda *given, preset: (models[preset], None, "earlier run"))
-    monkeypatch.setattr(measure, "available_models", lambda profile: list(models))
-    monkeypatch.setattr(measure, "SIGMAS", (0.1, 128.0))
-    path = measure.measure_noise_use(prepared, PROFILE)
-    table, _ = read_table(path)
-    errors, _ = read_table(path.with_name("x0_by_sigma.csv"))
-    levels = errors.groupby("model")["sigma"].apply(list)
-    assert levels["F3AMD-FNO-32"] == pytest.approx([0.1, 128.0])
-    # A network that is told the number of a step is asked at its own levels.
-    assert levels["CAMDM"] == pytest.approx(variance_preserving_cosine(4).levels.tolist(), rel=1e-6)
-    assert set(errors["noise"]) == {"variance_exploding", "variance_preserving_cosine"}
-    assert set(table["model"]) == set(models) and "x0_error_ratio" in table
-    use, _ = read_table(path.with_name("input_use.csv"))
-    assert set(zip(use["model"], use["metric"], strict=True)) == {
-        (model, metric) for model in models for metric in ("use_of_x", "use_of_sigma")
-    }
 
 
 def test_how_long_a_model_was_trained_is_written_down(prepared, tmp_path, monkeypatch):

@@ -11,21 +11,12 @@ import pandas as pd
 import pytest
 from builders import refused
 from f3amd_notebooks.stored_result import stored_result
-from matplotlib.colors import to_rgb
 from PIL import Image
 
-from f3amd_lib.drawing import pictures, stick_figures
 from f3amd_lib.drawing import style as figures
 from f3amd_lib.ground import papers, records, stored, tables
 from f3amd_lib.ground.names import counted_cores
-from f3amd_lib.motion.root_paths import named_path
-from f3amd_lib.motion.synthetic import synthesize
 from f3amd_lib.networks.presets import find_preset
-
-
-def make_motion(num_frames=120, fps=30.0):
-    return synthesize("Neutral", num_frames / 30.0, 0).replace(fps=fps, name="test walk")
-
 
 # ------------------------------------------------------------------------------------- records
 
@@ -65,15 +56,6 @@ def test_record_tells_no_folder_of_the_machine(tmp_path):
     assert home + "/" not in text and tempfile.gettempdir() + "/" not in text
     assert made["note"] == "read from ~/data/walk.bvh and <tmp>/x"
     assert made["inside"] == "./f3amd_lib/ground/records.py" and made["deep"]["list"][1] is None
-
-
-def test_record_without_git(monkeypatch):
-    def no_git(*arguments, **options):
-        raise FileNotFoundError("git")
-
-    monkeypatch.setattr(subprocess, "run", no_git)
-    made = record()
-    assert made["git_commit"] is None and made["git_dirty"] is None
 
 
 def test_git_state_of_a_checkout(tmp_path, monkeypatch):
@@ -221,24 +203,3 @@ def test_saved_figures_depend_on_the_drawing_alone(tmp_path):
 
 
 # ------------------------------------------------------------------------------------- pictures
-
-
-def count_near(image, color, tolerance=12):
-    pixels = np.asarray(image.convert("RGB"), dtype=int)
-    wanted = np.round(255 * np.array(to_rgb(color)))
-    return int((np.abs(pixels - wanted).max(axis=-1) <= tolerance).sum())
-
-
-def test_gif_plays_in_real_time_and_stays_small(tmp_path):
-    motion = make_motion(240)
-    path = pictures.write_gif(tmp_path / "deep" / "walk.gif", motion, target_paths=named_path("slalom", 240))
-    with Image.open(path) as image:
-        assert image.n_frames == 80 and image.size == (256, 256) and image.info["loop"] == 0
-        total = 0
-        for frame in range(image.n_frames):
-            image.seek(frame)
-            total += image.info["duration"]
-        assert total == 8000 + 600  # 8 s and a pause
-        image.seek(40)
-        for side in ("left", "right"):
-            assert count_near(image, stick_figures.LIMB_COLORS[side], tolerance=25) > 100

@@ -72,12 +72,6 @@ def test_seams_of_a_perfect_network_are_steps_like_any_other(trained):
     np.testing.assert_allclose(steps, 1.2 / 30, atol=1e-5)
 
 
-def test_each_round_starts_from_the_frames_made_before(trained):
-    rollout = obedient(trained).rollout(named_path("straight", 4 * WINDOW), "calm")
-    height = rollout.history[0, -1, 1] + np.arange(1, 4 * WINDOW + 1)
-    np.testing.assert_allclose(rollout.frames[0, :, 1], height, rtol=1e-5)
-
-
 def test_histories_may_be_longer_than_windows():
     window, history = 3, 5
     trained = tiny_trained(window=window, num_history=history, num_kept_modes=2)
@@ -118,28 +112,6 @@ def test_paths_that_are_no_multiple_of_the_window_are_cut(trained, num_frames):
     assert rollout.frames.shape == (1, num_frames, CHANNELS)
     np.testing.assert_allclose(rollout.frames[0][:, [0, 2]], path.position, atol=1e-5)
     assert rollout.motion().num_frames == num_frames
-
-
-def test_the_path_of_one_character_is_nothing_to_another(network_generator):
-    straight, circle = named_path("straight", 20), named_path("circle", 20)
-    first = network_generator.rollout([straight, straight], ["calm", "proud"]).frames
-    second = network_generator.rollout([straight, circle], ["calm", "proud"]).frames
-    np.testing.assert_allclose(first[0], second[0], atol=1e-5)
-    assert np.abs(first[1] - second[1]).max() > 1e-3
-
-
-def test_one_path_or_one_style_serves_all(network_generator):
-    path = named_path("straight", 10)
-    many = network_generator.rollout([path, path], ["calm", "calm"])
-    for paths, styles in ((path, ["calm", "calm"]), ([path, path], "calm")):
-        np.testing.assert_array_equal(network_generator.rollout(paths, styles).frames, many.frames)
-
-
-def test_noise_comes_from_the_seed_alone(network_generator):
-    path = named_path("straight", 20)
-    first, again, other = (network_generator.rollout(path, "calm", seed=seed).frames for seed in (1, 1, 2))
-    np.testing.assert_array_equal(first, again)
-    assert np.abs(first - other).max() > 1e-4
 
 
 def test_each_round_has_noise_of_its_own(trained):

@@ -8,7 +8,7 @@ import pytest
 from builders import packed_from, refused, straight_motion, wandering_motion
 from f3amd_notebooks.rank_agreement import rank_agreement
 
-from f3amd_companion.measuring.sensitivity import foot_spectrum, graded_corruptions, settling, summarise_corruptions
+from f3amd_companion.measuring import sensitivity
 from f3amd_lib.measures.protocol import Protocol
 
 SPAN = 20
@@ -79,7 +79,7 @@ PROTOCOL = Protocol(("calm", "proud"), num_seeds=2, windows_per_style=11)
 
 @pytest.fixture(scope="module")
 def graded(packed, classifier):
-    return graded_corruptions(packed, classifier, PROTOCOL, (0.0, 0.5, 1.0), splits=("test",))
+    return sensitivity.graded_corruptions(packed, classifier, PROTOCOL, (0.0, 0.5, 1.0), splits=("test",))
 
 
 def test_strength_0_is_real_motion_whatever_the_recipe(graded):
@@ -91,7 +91,7 @@ def test_strength_0_is_real_motion_whatever_the_recipe(graded):
 
 
 def test_more_noise_is_farther_away(graded):
-    means = summarise_corruptions(graded)
+    means = sensitivity.summarise_corruptions(graded)
     assert list(means) == ["corruption", "strength", "metric", "value", "low", "high", "repeats"]
     assert (means["repeats"] == 2).all()
     noisy = means[(means["corruption"] == "noisy motion") & (means["metric"] == "EMD")]
@@ -132,24 +132,13 @@ def gaussian_clouds(train, held_out):
 
 
 def test_settling_of_two_clouds_of_one_distribution_falls_towards_0():
-    curve = settling(gaussian_clouds(400, 180))
+    curve = sensitivity.settling(gaussian_clouds(400, 180))
     # 90 windows of a style: halvings of 45, times two styles.
     assert curve[curve["metric"] == "FID"]["windows"].tolist() == [2, 4, 10, 22, 44, 90]
     for metric in ("FID", "EMD"):
         values = curve[curve["metric"] == metric]["value"].to_numpy()
         assert 0 < values[-1] < 0.7 * values[0] and (np.diff(values) < 0).all()
-    pd.testing.assert_frame_equal(curve, settling(gaussian_clouds(400, 180)))
-
-
-def test_settling_draws_as_many_windows_of_each_style_and_at_most_half():
-    known = gaussian_clouds(40, 20)
-    # Where styles lie far apart, a mix of them would show; EMD of equal shares does not see it.
-    for reference in known.references.values():
-        reference.features[reference.styles == 1] += 1000.0
-    curve = settling(known).set_index(["metric", "windows"])
-    assert curve.index.unique("windows").tolist() == [2, 4, 10] and (curve["repeats"] == 5).all()
-    assert curve.loc[("EMD", 10), "value"] < 10.0
-    refused("fewer than two windows on a side", settling, gaussian_clouds(40, 2))
+    pd.testing.assert_frame_equal(curve, sensitivity.settling(gaussian_clouds(400, 180)))
 
 
 FREQUENCY = 3 * 30 / 64
@@ -168,7 +157,7 @@ def test_claim_q15_power_of_a_swaying_foot():
         ("real", 32, 0): [("calm", swaying(0.1)), ("proud", swaying(0.2)), ("proud", swaying(0.2))],
         ("F3AMD-FNO-96", 32, 8): [("calm", swaying(0.2)), ("proud", swaying(0.1, frequency=8.0))],
     }
-    table = foot_spectrum(systems).set_index(["model", "steps", "band", "metric"])
+    table = sensitivity.foot_spectrum(systems).set_index(["model", "steps", "band", "metric"])
     assert list(table) == ["window_frames", "value", "low", "high", "repeats"]
     # A step from frame to frame has the amplitude 2 sin(pi f / 30) of the sway; half its square.
     power = lambda amplitude: 0.5 * (30 * amplitude * 2 * np.sin(np.pi * FREQUENCY / 30)) ** 2
@@ -179,5 +168,5 @@ def test_claim_q15_power_of_a_swaying_foot():
     assert table.xs("toe_power_over_real", level="metric").loc["real"]["value"].tolist() == [1.0] * 3
 
     only = {key: [pair for pair in pairs if pair[0] == "calm"] for key, pairs in systems.items()}
-    table = foot_spectrum(only).set_index(["model", "band", "metric"])["value"]
+    table = sensitivity.foot_spectrum(only).set_index(["model", "band", "metric"])["value"]
     assert table["F3AMD-FNO-96", "0.5-2 Hz", "toe_power_over_real"] == pytest.approx(4.0, rel=1e-6)

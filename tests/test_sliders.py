@@ -62,7 +62,7 @@ def test_every_frame_is_there_and_lies_where_matplotlib_would_draw_it(drawn):
 
 def sliders(name: str) -> list[str]:
     """The sliders in the committed outputs of a notebook."""
-    notebook = nbformat.read(repository_root() / "notebooks" / f"{name}.ipynb", as_version=4)
+    notebook = nbformat.v4.reads((repository_root() / "notebooks" / f"{name}.ipynb").read_text("utf-8"))
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
     shown = ["".join(output.get("data", {}).get("text/html", "")) for output in outputs]
     return [text for text in shown if "class='slider'" in text]

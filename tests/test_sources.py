@@ -91,16 +91,6 @@ def test_synthetic_takes(no_network):
     assert np.abs(motion.positions - direct.positions).max() < 1e-4
 
 
-def test_synthetic_options():
-    dataset = open_dataset("synthetic", seconds_per_style=6.0, num_styles=2)
-    assert len(dataset.styles) == 2 and len(dataset.clips) == 6
-    assert dataset.clips[0].load().num_frames == 60
-    assert dataset.fingerprint == open_dataset("synthetic", seconds_per_style=6, num_styles=2).fingerprint
-    assert dataset.fingerprint != open_dataset("synthetic", seconds_per_style=7.0, num_styles=2).fingerprint
-    refused(r"at least 4\.2 .*got 4\.0", open_dataset, "synthetic", seconds_per_style=4.0)
-    refused("at least", open_dataset, "synthetic", seconds_per_style=float("nan"))
-
-
 # --- folder ---------------------------------------------------------------------------------------
 
 
@@ -291,21 +281,6 @@ def test_100style_broken_tables(tmp_path, table, old, new, message):
     refused(f"{table}.*{message}", open_dataset, "100style", path=tmp_path)
 
 
-def test_100style_own_tables(data_dir):
-    """The release's real tables, where someone put them beside the data."""
-    folder = data_dir if data_dir.is_dir() else data_dir.parent
-    if not (folder / "100style_Frame_Cuts.csv").is_file():
-        pytest.skip("no 100style_Frame_Cuts.csv in the data folder")
-    names = ("Frame_Cuts.csv", "Dataset_List.csv")
-    files = {name: sources._File(name, (folder / f"100style_{name}").read_bytes) for name in names}
-    cuts = sources._read_frame_cuts(folder, files)
-    assert len(cuts) == 810 and len({style for style, _ in cuts}) == 100
-    assert sum(stop - start for start, stop in cuts.values()) == 4_055_978
-    assert cuts["Aeroplane", "BR"] == (318, 5593)
-    symmetric = sources._read_symmetric(folder, files)
-    assert len(symmetric) == 70 and "Zombie" in symmetric and "LimpLeft" not in symmetric
-
-
 # --- Bandai: the committed list -------------------------------------------------------------------
 
 
@@ -406,18 +381,6 @@ def test_bandai_refuses_a_truncated_zip_by_name(small_bandai, tmp_path, share):
     data = zipped.read_bytes()
     zipped.write_bytes(data[: int(share * len(data))])
     refused(r"bandai_namco\.zip: broken or truncated zip archive", open_dataset, "bandai", path=tmp_path)
-
-
-def test_bandai_refuses_flipped_bits_inside_a_zip(small_bandai, tmp_path):
-    zipped = zip_folder(small_bandai, tmp_path / "bandai_namco.zip")
-    with zipfile.ZipFile(zipped) as archive:
-        (info,) = [item for item in archive.infolist() if "angry_002" in item.filename]
-    data = bytearray(zipped.read_bytes())
-    data[info.header_offset + 200] ^= 0xFF  # inside the compressed text
-    zipped.write_bytes(bytes(data))
-    dataset = open_dataset("bandai", path=zipped)
-    (clip,) = [clip for clip in dataset.clips if "angry_002" in clip.name]
-    refused(r"bandai_namco\.zip: .*angry_002\.bvh: damaged", clip.load)
 
 
 def test_several_archives_are_not_guessed_between(small_bandai, tmp_path):

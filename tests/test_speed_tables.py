@@ -3,9 +3,9 @@
 import numpy as np
 import pandas as pd
 from builders import refused
-from f3amd_notebooks.beside_printed import speedups, speedups_by_turns, times_beside_paper, training_beside_paper
+from f3amd_notebooks.beside_printed import speedups_by_turns, times_beside_paper, training_beside_paper
 
-from f3amd_companion.speed.speed_tables import fastest_implementations, speed_bars
+from f3amd_companion.speed import speed_tables
 from f3amd_lib.ground.papers import load_paper_table
 
 
@@ -31,7 +31,7 @@ GOOD = (
 
 
 def test_bars_take_the_fastest_way_and_say_what_is_met():
-    bars = speed_bars(measured(*GOOD)).set_index("what")
+    bars = speed_tables.speed_bars(measured(*GOOD)).set_index("what")
     by_place = bars["measured"].tolist()
     np.testing.assert_allclose(by_place, [0.7, 0.6, 0.8, 0.9, 60.0, 7.5, 50.0, 0.5])
     assert bars["met"].tolist() == ["yes", "no", "yes", "yes", "yes", "yes", "yes", "no"]
@@ -53,7 +53,7 @@ def test_fastest_way_of_each_framework_in_float32():
         ("F3AMD-FNO-96", 1, "jax", "jit", 1, 0.7, "float32"),
     )
     table.index = [0] * len(table)  # as pieces of several runs have
-    found = fastest_implementations(table)
+    found = speed_tables.fastest_implementations(table)
     assert list(found["value"]) == [2.0, 4.0, 0.7]
     assert list(found["way"]) == ["jit, all devices", "PyTorch", "jit"]
 
@@ -65,14 +65,6 @@ def test_speedups_take_both_times_from_the_same_turns():
     table = pd.concat([bars.assign(suite="bars"), family.assign(suite="family"), main])
     found = speedups_by_turns(table).set_index("model")["speedup"]
     assert found.to_dict() == {"F3AMD-FNO-96": 10.0, "F3AMD-FNO-64": 10.0}
-
-
-def test_speedups_of_the_paper_are_those_of_figure_4():
-    paper = speedups(load_paper_table(4))
-    one = paper[(paper["model"] == "F3AMD-FNO-96") & (paper["steps"] == 1)]
-    gains = one.set_index(["device", "characters"])["speedup"]
-    assert 24 < gains["GPU", 1024] < 27  # "25 times faster for 1024 characters on GPU"
-    assert 3.5 < gains["GPU", 16] < 4.5  # "4 times faster for 16 characters"
 
 
 def test_ours_stand_beside_the_papers_cells():

@@ -4,17 +4,8 @@ import pandas as pd
 import pytest
 from builders import refused
 
-from f3amd_lib.ground import stored
+from f3amd_lib.ground import records, stored
 from f3amd_lib.ground.profiles import load_profile, repository_root
-from f3amd_lib.ground.records import (
-    ON_WEIGHTS,
-    THROUGH_CLASSIFIER,
-    folder_reason,
-    read_table,
-    run_record,
-    stale_reason,
-    write_table,
-)
 from f3amd_lib.ground.trees import weights_digest
 from f3amd_lib.training.checkpoints import load_model
 from f3amd_lib.training.pipeline import PRETRAINED_DIR
@@ -24,8 +15,8 @@ def test_committed_tables_are_found_checked_or_absent(tmp_path, monkeypatch):
     monkeypatch.setattr(stored, "repository_root", lambda: tmp_path)
     assert stored.committed_table("synthetic", "learning") is None
     path = tmp_path / "paper_figures/synthetic/laptop/records/learning.csv"
-    record = run_record(profile="laptop", dataset="synthetic", seed=3)
-    write_table(path, pd.DataFrame({"model": ["m"], "loss": [0.5]}), record)
+    record = records.run_record(profile="laptop", dataset="synthetic", seed=3)
+    records.write_table(path, pd.DataFrame({"model": ["m"], "loss": [0.5]}), record)
     table, read = stored.committed_table("synthetic", "learning")
     assert table["loss"].tolist() == [0.5] and read["seed"] == 3
     assert stored.committed_table("bandai", "learning") is None
@@ -39,9 +30,9 @@ def test_measured_tables_are_those_of_the_data_set_then_bandais_and_say_so(tmp_p
     assert found is None
     assert "`make measure MEASURE=quality DATA=bandai`" in sentence
     for dataset, value in (("bandai", 1.0), ("synthetic", 2.0)):
-        record = run_record(profile=load_profile("laptop", dataset), dataset=dataset, seed=0)
+        record = records.run_record(profile=load_profile("laptop", dataset), dataset=dataset, seed=0)
         path = tmp_path / "paper_figures" / dataset / "laptop" / "records" / "quality.csv"
-        write_table(path, pd.DataFrame({"value": [value]}), record)
+        records.write_table(path, pd.DataFrame({"value": [value]}), record)
         found, sentence = stored.measured_table("synthetic", "quality", "quality")
         assert found["value"].tolist() == [value]
         assert found.attrs["dataset"] == dataset
@@ -76,25 +67,27 @@ REFERENCE = {"weights_digests": {"A": ["aa"], "real": ["cc"]}, "classifier_weigh
     ],
 )
 def test_a_record_of_other_weights_or_another_classifier_is_stale(name, record, reason):
-    assert stale_reason(name, record, REFERENCE) == reason
+    assert records.stale_reason(name, record, REFERENCE) == reason
     if "does not say which style" not in reason:  # that is wrong beside any quality table
-        assert stale_reason(name, record, {}) == ""
+        assert records.stale_reason(name, record, {}) == ""
 
 
 def test_a_stale_table_is_marked_for_notebooks(tmp_path, monkeypatch):
     monkeypatch.setattr(stored, "repository_root", lambda: tmp_path)
     folder = tmp_path / "paper_figures/bandai/laptop/records"
-    record = run_record(profile="laptop", dataset="bandai", seed=0)
-    write_table(folder / "quality.csv", pd.DataFrame({"value": [1.0]}), record | {"weights_digests": {"A": ["aa"]}})
+    record = records.run_record(profile="laptop", dataset="bandai", seed=0)
+    records.write_table(
+        folder / "quality.csv", pd.DataFrame({"value": [1.0]}), record | {"weights_digests": {"A": ["aa"]}}
+    )
     for digest, stale in (("aa", False), ("ab", True)):
-        write_table(
+        records.write_table(
             folder / "walking.csv", pd.DataFrame({"value": [1.0]}), record | {"weights_digests": {"A": [digest]}}
         )
         assert stored.measured_table("bandai", "walking", "walking")[1].startswith("**Stale: ") is stale
 
 
 RECORDS = sorted((repository_root() / "paper_figures").glob("*/*/records/*.csv"))
-COMMITTED = [path for path in RECORDS if path.stem in ON_WEIGHTS | THROUGH_CLASSIFIER]
+COMMITTED = [path for path in RECORDS if path.stem in records.ON_WEIGHTS | records.THROUGH_CLASSIFIER]
 
 
 @pytest.fixture(scope="module")
@@ -110,18 +103,8 @@ STALE: set[str] = set()
 @pytest.mark.parametrize("path", COMMITTED, ids=lambda path: path.stem)
 def test_committed_records_are_of_the_weights_that_ship_or_are_marked(path, shipped_digests):
     """Of the weights that ship, and seen through the classifier of the quality table."""
-    _, record = read_table(path)
-    assert bool(folder_reason(path, record)) == (path.stem in STALE)
+    _, record = records.read_table(path)
+    assert bool(records.folder_reason(path, record)) == (path.stem in STALE)
     for model, digests in (record.get("weights_digests") or {}).items():
         if (record["dataset"], model) in shipped_digests:
             assert digests == [shipped_digests[record["dataset"], model]], model
-
-
-def test_every_record_that_names_models_that_ship_is_held_to_their_weights(shipped_digests):
-    named = {
-        path.stem
-        for path in RECORDS
-        for model in read_table(path)[1].get("weights_digests") or {}
-        if (path.parts[-4], model) in shipped_digests
-    }
-    assert {"quality", "trained", "feet", "input_use"} <= named and named <= ON_WEIGHTS

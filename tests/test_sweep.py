@@ -69,14 +69,6 @@ def test_snapshots_of_one_run_follow_each_other_and_others_do_not():
     assert [leg.preset for leg in plan(["campaign"], [B], PROFILE, QUEUE)] == [B]
 
 
-def test_a_preset_is_trained_once_before_all_that_is_measured_of_it():
-    legs = plan(["walking", "noise_use"], [A, "F3AMD-FNO-48", A], PROFILE, QUEUE)
-    assert len(legs) == len({leg.name for leg in legs}) == 2 + 2 * 2
-    after = {leg.name: leg.after for leg in legs}
-    assert after[f"walking-{A}"] == after[f"noise_use-{A}"] == f"train-{A}"
-    assert after[f"train-{A}"] is None
-
-
 @pytest.mark.parametrize(
     ("names", "models", "told"),
     [

@@ -9,13 +9,6 @@ import pytest
 
 from f3amd_companion.__main__ import main
 from f3amd_lib.text.data import text_encoders
-from f3amd_lib.text.data.text_encoders import (
-    TextEmbeddings,
-    check_words,
-    embed_captions,
-    load_clip_pieces,
-    load_text_encoder,
-)  # fmt: skip
 
 
 class Letters:
@@ -26,14 +19,14 @@ class Letters:
     def __init__(self):
         self.calls = 0
 
-    def __call__(self, captions) -> TextEmbeddings:
+    def __call__(self, captions) -> text_encoders.TextEmbeddings:
         self.calls += 1
         pieces = [np.array([[ord(c), ord(c)] for c in caption], np.float32) for caption in captions]
         return text_encoders._padded(pieces, [piece.mean(axis=0) for piece in pieces])
 
 
 def test_captions_of_unlike_lengths_are_padded_and_masked(cache_dir):
-    embedded = embed_captions(["ab", "abcd"], Letters())
+    embedded = text_encoders.embed_captions(["ab", "abcd"], Letters())
     assert embedded.tokens.shape == (2, 4, 2) and embedded.mask.tolist() == [[True, True, False, False], [True] * 4]
     assert np.all(embedded.tokens[0, 2:] == 0) and embedded.tokens[1, 3, 0] == ord("d")
     assert embedded.pooled[0, 0] == pytest.approx(ord("a") + 0.5)
@@ -41,26 +34,27 @@ def test_captions_of_unlike_lengths_are_padded_and_masked(cache_dir):
 
 def test_what_was_embedded_is_not_embedded_again(cache_dir):
     encoder, captions = Letters(), ["ab", "abcd"]
-    first = embed_captions(captions, encoder)
-    again = embed_captions(captions, encoder)
+    first = text_encoders.embed_captions(captions, encoder)
+    again = text_encoders.embed_captions(captions, encoder)
     assert encoder.calls == 1
     assert all(np.array_equal(mine, theirs) for mine, theirs in zip(first, again, strict=True))
-    embed_captions(captions[::-1], encoder)
+    text_encoders.embed_captions(captions[::-1], encoder)
     assert encoder.calls == 2
     for file in cache_dir.iterdir():
         file.write_bytes(file.read_bytes()[:50])
-    assert np.array_equal(embed_captions(captions, encoder).tokens, first.tokens) and encoder.calls == 3
+    assert np.array_equal(text_encoders.embed_captions(captions, encoder).tokens, first.tokens) and encoder.calls == 3
 
 
 def test_encoders_of_unlike_weights_do_not_share_what_they_embedded(cache_dir):
     other = Letters()
     other.identity = "letters-of-another-folder"
     for encoder in (Letters(), other):
-        embed_captions(["ab", "abcd"], encoder)
+        text_encoders.embed_captions(["ab", "abcd"], encoder)
         assert encoder.calls == 1
 
 
-def test_training_and_measuring_take_an_encoder_by_name(tmp_path, capsys):
+def test_training_and_measuring_take_an_encoder_by_name(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("f3amd_lib.text.stages.text_models.open_text_motions", lambda *_: None)
     for words in (["train", "--preset", "judge"], ["measure", "text_judge"]):
         assert main([*words, "--data", "bandai", "--text-encoder", "t5", "--text-weights", str(tmp_path)]) == 2
         assert f"t5: {tmp_path / 'config.json'} is missing" in capsys.readouterr().err
@@ -70,7 +64,10 @@ def test_training_and_measuring_take_an_encoder_by_name(tmp_path, capsys):
     "printed, typed", [("“A person’s”", '"A person\'s"'), ("well‑known … – so", "well-known ...  -  so")]
 )
 def test_printers_quotes_and_dashes_are_embedded_as_those_of_a_keyboard(cache_dir, printed, typed):
-    assert np.array_equal(embed_captions([printed], Letters()).tokens, embed_captions([typed], Letters()).tokens)
+    assert np.array_equal(
+        text_encoders.embed_captions([printed], Letters()).tokens,
+        text_encoders.embed_captions([typed], Letters()).tokens,
+    )
 
 
 @pytest.mark.parametrize(
@@ -83,23 +80,23 @@ def test_printers_quotes_and_dashes_are_embedded_as_those_of_a_keyboard(cache_di
 )
 def test_an_empty_caption_is_refused(cache_dir, captions, words):
     with pytest.raises(ValueError, match=words):
-        embed_captions(captions, Letters())
+        text_encoders.embed_captions(captions, Letters())
 
 
 def test_words_that_a_model_never_saw_are_named():
     known = ["a person raises the left hand", "an elderly person walks"]
-    check_words("An elderly person raises the hand.", known)
-    check_words("A person’s hand", ["a person's hand"])
+    text_encoders.check_words("An elderly person raises the hand.", known)
+    text_encoders.check_words("A person’s hand", ["a person's hand"])
     with pytest.raises(ValueError, match="never saw 'walsk', 'happily'; did you mean 'walks'.*--any-words"):
-        check_words("a person walsk happily", known)
+        text_encoders.check_words("a person walsk happily", known)
 
 
 def test_unknown_encoders_and_missing_weights_are_named(tmp_path):
     with pytest.raises(ValueError, match="unknown text encoder 'wordlama'; did you mean 'wordllama'"):
-        load_text_encoder("wordlama")
+        text_encoders.load_text_encoder("wordlama")
     for name in ("clip", "t5"):
         with pytest.raises(ValueError, match=rf"{name}: .*config.json is missing; give the folder"):
-            load_text_encoder(name, tmp_path)
+            text_encoders.load_text_encoder(name, tmp_path)
 
 
 # ----------------------------------------------------------------------------------- the real ones
@@ -107,21 +104,21 @@ def test_unknown_encoders_and_missing_weights_are_named(tmp_path):
 
 @pytest.fixture(scope="module")
 def wordllama():
-    return load_text_encoder("wordllama")
+    return text_encoders.load_text_encoder("wordllama")
 
 
-@pytest.mark.needs("wordllama", "tokenizers")
+@pytest.mark.wants("wordllama", "tokenizers")
 def test_wordllama_works_without_a_network(monkeypatch, cache_dir):
     def refuse(*args, **kwargs):
         pytest.fail("the network was touched")
 
     monkeypatch.setattr(socket, "socket", refuse)
-    embedded = embed_captions(["a person raises the left hand"], load_text_encoder())
+    embedded = text_encoders.embed_captions(["a person raises the left hand"], text_encoders.load_text_encoder())
     assert embedded.tokens.shape == (1, 7, 256) and embedded.tokens.dtype == np.float32
     assert np.allclose(embedded.pooled, embedded.tokens.mean(axis=1), atol=1e-6)
 
 
-@pytest.mark.needs("wordllama", "tokenizers")
+@pytest.mark.wants("wordllama", "tokenizers")
 def test_wordllama_tells_actions_apart(wordllama):
     def cosine(first, second):
         a, b = wordllama([first, second]).pooled
@@ -137,18 +134,18 @@ def test_wordllama_tells_actions_apart(wordllama):
     assert np.abs(tokens[0] - tokens[1]).max() > 0.1
 
 
-@pytest.mark.needs("wordllama", "tokenizers")
+@pytest.mark.wants("wordllama", "tokenizers")
 def test_wordllama_refuses_what_it_cannot_read(wordllama):
     with pytest.raises(ValueError, match="characters unknown to wordllama"):
         wordllama(["a person \U0001f6b6 walks"])
 
 
-@pytest.mark.needs("wordllama", "tokenizers")
+@pytest.mark.wants("wordllama", "tokenizers")
 def test_no_words_are_the_zero_vector_to_a_mean_of_words(wordllama):
     assert wordllama.embed([""])[1][0].tolist() == [0.0] * 256 and not wordllama([""]).pooled.any()
 
 
-@pytest.mark.needs("wordllama", "tokenizers")
+@pytest.mark.wants("wordllama", "tokenizers")
 def test_a_long_caption_is_cut_and_that_is_said_once(wordllama):
     said = "a person walks " * 10
     with warnings.catch_warnings():
@@ -163,7 +160,7 @@ def test_a_long_caption_is_cut_and_that_is_said_once(wordllama):
     assert [str(one.message) for one in told] == ["captions of more than 77 word pieces are cut there"]
 
 
-@pytest.mark.needs("tokenizers")
+@pytest.mark.wants("tokenizers")
 def test_word_pieces_are_told_by_their_numbers(tmp_path):
     import tokenizers
 
@@ -173,14 +170,14 @@ def test_word_pieces_are_told_by_their_numbers(tmp_path):
     ends = [("<start>", 1), ("<end>", 2)]
     tokenizer.post_processor = tokenizers.processors.TemplateProcessing(single="<start> $A <end>", special_tokens=ends)
     tokenizer.save(str(tmp_path / "tokenizer.json"))
-    encoder = load_clip_pieces(tmp_path)
+    encoder = text_encoders.load_clip_pieces(tmp_path)
     embedded = encoder(["a walk", "walk"])
     assert embedded.tokens[..., 0].tolist() == [[1, 3, 4, 2], [1, 4, 2, 0]] and embedded.mask.sum() == 7
     with pytest.warns(UserWarning, match="cut there"):
         cut = encoder(["walk " * 100])
     assert cut.tokens[0, [0, -1], 0].tolist() == [1, 2] and cut.mask.sum() == 77
     with pytest.raises(ValueError, match="tokenizer.json: no tokeniser"):
-        load_clip_pieces(tmp_path / "elsewhere")
+        text_encoders.load_clip_pieces(tmp_path / "elsewhere")
 
 
 @pytest.mark.needs("transformers", "torch")
@@ -200,8 +197,8 @@ def test_clip_by_way_of_transformers(tmp_path, cache_dir):
     ends = {"bos_token_id": 0, "eos_token_id": 1, "pad_token_id": 1}
     config = transformers.CLIPTextConfig(vocab_size=len(pieces), projection_dim=12, **sizes, **ends)
     transformers.CLIPTextModelWithProjection(config).save_pretrained(tmp_path)
-    encoder = load_text_encoder("clip", tmp_path)
-    embedded = embed_captions(["walk", "he runs"], encoder)
+    encoder = text_encoders.load_text_encoder("clip", tmp_path)
+    embedded = text_encoders.embed_captions(["walk", "he runs"], encoder)
     assert encoder.width == 16 and embedded.tokens.shape[::2] == (2, 16) and embedded.pooled.shape == (2, 12)
     assert embedded.mask.sum(axis=1).tolist() == [6, 8]
     with pytest.warns(UserWarning, match="cut there"):

@@ -20,8 +20,8 @@ from f3amd_lib.networks import presets
 from f3amd_lib.networks.presets import Preset
 from f3amd_lib.text.data import text_encoders
 from f3amd_lib.text.sampling import captioned_motion
-from f3amd_lib.text.stages import acmdm_training, text_models, train_stage
-from f3amd_lib.text.stages.text_models import controlled_joints, find_text_model, load_text_model, save_text_model
+from f3amd_lib.text.stages import acmdm_training, train_stage
+from f3amd_lib.text.stages.text_models import controlled_joints, load_text_model, save_text_model
 
 STYLES = synthetic.STYLES[:2]
 SIZES = {"latent_width": 16, "depth": 1, "num_heads": 2, "channels": 3, "window": 40}
@@ -107,25 +107,6 @@ def test_a_branch_of_the_pelvis_learns_the_pelvis_alone(folder):
     assert captioned_motion.find_joint(every, "left_wrist") == every.controlled["left_wrist"]
     with pytest.raises(ValueError, match="unknown joint 'left_wrist'"):
         captioned_motion.find_joint(pelvis, "left_wrist")
-
-
-@pytest.mark.slow
-def test_a_branch_stands_beside_the_network_that_ships_where_that_knows_the_motions(
-    folder, data, tmp_path, monkeypatch
-):
-    shipped, encoder = load(folder, "tiny"), ENCODER
-    place = tmp_path / "pretrained" / "bandai" / "text"
-    place.mkdir(parents=True)
-    marked = dataclasses.replace(shipped, record=shipped.record | {"guidance": 1.5})
-    save_text_model(place / "tiny.safetensors", marked, jnp.float32)
-    monkeypatch.setattr(text_models, "PRETRAINED_DIR", tmp_path / "pretrained")
-    made = train_stage.train_stage(data, encoder, PROFILE, "tiny+control", folder=tmp_path / "own", **QUIET)
-    assert not (tmp_path / "own" / "tiny.safetensors").exists() and made.record["guidance"] == 1.5
-    for one, other in zip(jax.tree.leaves(made.params), jax.tree.leaves(shipped.params), strict=True):
-        np.testing.assert_allclose(one, other, rtol=0.01)  # written in 16 bits
-    # Of other motions it knows nothing: the base is trained first.
-    train_stage.train_stage(data.cut(32), encoder, PROFILE, "tiny+control", folder=tmp_path / "other", **QUIET)
-    assert (tmp_path / "other" / "tiny.safetensors").exists()
 
 
 @pytest.mark.slow
@@ -219,16 +200,6 @@ def test_a_training_goes_on_where_it_was_killed_and_ends_as_one_that_was_not(fol
 
 
 @pytest.mark.slow
-def test_a_finished_model_is_taken_as_it_is_and_one_of_other_settings_refused(folder, data):
-    before = (folder / "tiny.safetensors").read_bytes()
-    train = lambda profile: train_stage.train_stage(data, ENCODER, profile, "tiny", folder=folder, **QUIET)
-    assert same_tree(train(PROFILE).params, load(folder, "tiny").params)
-    with pytest.raises(ValueError, match=r"training settings \(seed\) lies there.*--out"):
-        train(dataclasses.replace(PROFILE, seed=5))
-    assert (folder / "tiny.safetensors").read_bytes() == before
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "message"),
     [
@@ -288,18 +259,6 @@ def test_a_model_of_meshes_makes_vertices_and_the_joints_of_them(folder, data, t
     np.testing.assert_allclose(mesh.joints(meshes), joints, atol=1e-4)
     with pytest.raises(ValueError, match="tiny makes joints, no mesh"):
         captioned_motion.draw_motions(load(folder, "tiny"), np.zeros((1, 8)), 24, jax.random.key(0), mesh=True)
-
-
-@pytest.mark.slow
-def test_models_are_found_by_name_or_the_newest(folder, monkeypatch):
-    monkeypatch.setattr(text_models, "runs_dir", lambda *_: folder.parent)
-    (folder.parent / "text").symlink_to(folder)
-    assert find_text_model("bandai", "tiny").name == "tiny.safetensors"
-    assert find_text_model("bandai").name in ("tiny.safetensors", "tiny-prefix.safetensors")
-    assert find_text_model("bandai", control=True).name == "tiny+control.safetensors"
-    assert find_text_model("bandai", "tiny+control-pelvis", control=True).name == "tiny+control-pelvis.safetensors"
-    with pytest.raises(ValueError, match=r"no trained ACMDM-S-PS22 .*f3amd train --preset ACMDM-S-PS22 --data bandai"):
-        find_text_model("bandai", "ACMDM-S-PS22")
 
 
 # ---------------------------------------------------------------------------------------------------------- told motion

@@ -6,7 +6,6 @@ import tomllib
 from importlib import resources
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from builders import packed_from, stiff_walk
@@ -17,8 +16,7 @@ from f3amd_lib.drawing.pictures import film_strip
 from f3amd_lib.motion.rotations import matrix_from_yaw
 from f3amd_lib.motion.skeleton import Motion, Skeleton, turn
 from f3amd_lib.text.data import text_motions
-from f3amd_lib.text.data.redundant import positions_from_redundant
-from f3amd_lib.text.data.text_motions import AxisNormaliser, TextMotions, clip_table, draw_clips, pad_motions
+from f3amd_lib.text.data.text_motions import AxisNormaliser, TextMotions, clip_table, draw_clips
 
 WORDS = tomllib.loads((resources.files("f3amd_lib.text.data") / "captions.toml").read_text(encoding="utf-8"))
 SKELETON = Skeleton(
@@ -162,12 +160,6 @@ def test_normalisation_is_by_axis_and_of_training_clips():
     assert np.all(np.isfinite(AxisNormaliser.of(np.ones((5, 3))).normalise(np.ones(3))))  # no zero divides
 
 
-def test_padding():
-    batch = pad_motions([np.ones((5, 2, 3)), np.ones((9, 2, 3))], num_frames=8)
-    assert batch.motion.shape == (2, 8, 2, 3) and batch.length.tolist() == [5, 8]
-    assert batch.mask.sum(axis=1).tolist() == [5, 8] and float(jnp.abs(batch.motion[0, 5:]).sum()) == 0
-
-
 def test_drawn_clips_are_whole_pieces_of_clips_with_their_own_captions():
     toy = data()
     table, texts = clip_table(toy, toy.positions)
@@ -260,15 +252,6 @@ def test_bandai_twins_share_their_split_and_swap_their_sides(made):
             assert made.splits[twin] == made.splits[number] and made.lengths[twin] == made.lengths[number]
             assert made.captions[twin] == tuple(map(text_motions.other_side, made.captions[number]))
             assert np.allclose(made.clip(twin)[..., 0].mean(), -made.clip(number)[..., 0].mean(), atol=0.02)
-
-
-def test_bandai_vectors_go_back_to_the_same_positions(made):
-    vectors = made.redundant_vectors()
-    assert vectors.shape == (len(made.positions), 251)
-    assert np.array_equal(vectors[:, : 4 + 60], made.essential_features())
-    for number in range(made.num_clips):
-        rows = slice(made.start[number], made.start[number + 1])
-        assert np.abs(positions_from_redundant(vectors[rows].astype(np.float64)) - made.clip(number)).max() < 1e-5
 
 
 def test_captions_are_for_bandai(some_bandai):

@@ -11,14 +11,7 @@ from builders import captioned_walks, refused
 from test_text_models import ENCODER, PROFILE, TINY
 
 from f3amd_companion.measuring import text_tables
-from f3amd_companion.measuring.text_tables import (
-    UNCONTROLLED,
-    Bench,
-    asked_frames,
-    measure_text_table,
-    obtain_judge,
-    planned,
-)
+from f3amd_companion.measuring.text_tables import UNCONTROLLED, Bench, measure_text_table, obtain_judge, planned
 from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.ground.trees import weights_digest
@@ -77,7 +70,7 @@ def tables(data, tmp_path_factory):
         yield made
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_every_table_has_the_columns_that_the_ledger_reads(tables):
     for name, table in tables.items():
         keys = list(SCHEMAS[name])
@@ -89,7 +82,7 @@ def test_every_table_has_the_columns_that_the_ledger_reads(tables):
     assert "multimodality" in set(tables["text_table1"]["metric"])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_control_is_measured_by_joint_for_branch_and_optimised_noise(tables):
     table = tables["text_table3"].set_index(["section", "joint", "metric"])["value"]
     for section in ("trained on all joints", "noise optimisation"):
@@ -107,7 +100,7 @@ def test_control_is_measured_by_joint_for_branch_and_optimised_noise(tables):
     assert weights["trained on pelvis"] != weights["trained on all joints"] == weights["upper-body edit"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_table_3_is_the_mean_over_numbers_of_frames(tables):
     each = tables["text_control"]
     assert list(each["frames"].unique()) == ["1", "2", "5", "25%", "100%"]
@@ -116,13 +109,13 @@ def test_table_3_is_the_mean_over_numbers_of_frames(tables):
     assert len(means) > 0 and table[means.index].to_numpy() == pytest.approx(means.to_numpy())
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_meshes_are_judged_by_their_joints_and_their_surface(tables):
     table = tables["text_table4"].set_index("metric")["value"]
     assert table["LSD"] > 0 and {"text_FID", "foot_skating"} <= set(table.index)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_guidance_and_first_frames_arrive(tables):
     one, other = (part["value"].to_numpy() for _, part in tables["text_tableA1"].groupby("cfg"))
     assert not np.array_equal(one, other)  # three steps of training: the text hardly matters yet
@@ -163,15 +156,6 @@ def test_the_judge_that_ships_looks_at_the_data_that_it_knows_and_at_no_other(da
     for other in ((data, reader), (its, ENCODER)):
         assert obtain_judge(*other, PROFILE, folder=tmp_path) is None  # trained, and out of time
     assert len(trained) == 2
-
-
-def test_asked_frames_are_so_many_of_the_true_length():
-    generator = np.random.default_rng(0)
-    assert asked_frames(generator, [40, 24], 5).sum(axis=1).tolist() == [5, 5]
-    assert asked_frames(generator, [40, 24], 0.25).sum(axis=1).tolist() == [10, 6]
-    whole = asked_frames(generator, [40, 24], 1.0)
-    assert whole.sum(axis=1).tolist() == [40, 24] and not whole[1, 24:].any()
-    assert asked_frames(generator, [3], 5).sum() == 3
 
 
 def test_variety_is_that_of_one_captions_motions(data):

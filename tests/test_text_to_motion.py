@@ -10,16 +10,7 @@ from test_acmdm import BATCH, condition, config_of, fresh, normal
 
 from f3amd_lib.diffusion.schedules import straight
 from f3amd_lib.text.networks.acmdm import Control, MaskedACMDMConfig, control_branch, controlled
-from f3amd_lib.text.sampling.text_to_motion import (
-    continue_prefix,
-    control_prediction,
-    sample_blocks,
-    sample_control,
-    sample_masked,
-    sample_text,
-    text_prediction,
-    with_guidance,
-)
+from f3amd_lib.text.sampling import text_to_motion
 
 SCHEDULE, NOISE = straight(), normal(1, BATCH, 8, 5, 4)
 EULER = {"sampler": "ddim", "num_steps": 2}
@@ -32,12 +23,14 @@ def network():
 
 
 def test_guidance_of_one_is_the_condition_and_of_zero_none(network):
-    text = lambda told: text_prediction(network, told)
+    text = lambda told: text_to_motion.text_prediction(network, told)
     time = jnp.asarray([0.2, 0.6])
     told, free = text(TOLD)(NOISE, time), text(TOLD.without_text())(NOISE, time)
-    np.testing.assert_array_equal(with_guidance(text, TOLD, 1.0)(NOISE, time), told)
-    np.testing.assert_allclose(with_guidance(text, TOLD, 0.0)(NOISE, time), free, atol=1e-6)
-    np.testing.assert_allclose(with_guidance(text, TOLD, 3.0)(NOISE, time), free + 3.0 * (told - free), atol=1e-4)
+    np.testing.assert_array_equal(text_to_motion.with_guidance(text, TOLD, 1.0)(NOISE, time), told)
+    np.testing.assert_allclose(text_to_motion.with_guidance(text, TOLD, 0.0)(NOISE, time), free, atol=1e-6)
+    np.testing.assert_allclose(
+        text_to_motion.with_guidance(text, TOLD, 3.0)(NOISE, time), free + 3.0 * (told - free), atol=1e-4
+    )
     assert float(jnp.abs(told - free).max()) > 1e-3
 
 
@@ -47,25 +40,18 @@ def test_control_guidance_of_one_and_one_is_the_controlled_network(network):
     control = Control.of(normal(3, BATCH, 32, 5, 3), jnp.zeros((BATCH, 32, 5)).at[:, 3, 1].set(1.0))
     time = jnp.asarray([0.2, 0.6])
     full = controlled(network, branch, TOLD, control)(NOISE, time)
-    once = control_prediction(network, branch, TOLD, control, 1.0, 1.0)(NOISE, time)
+    once = text_to_motion.control_prediction(network, branch, TOLD, control, 1.0, 1.0)(NOISE, time)
     np.testing.assert_allclose(once, full, atol=1e-6)
     no_text = controlled(network, branch, TOLD.without_text(), control)(NOISE, time)
     no_control = controlled(network, branch, TOLD, control.dropped())(NOISE, time)
     wanted = full + 1.5 * (full - no_text) + 0.75 * (full - no_control)
-    pushed = control_prediction(network, branch, TOLD, control)(NOISE, time)
+    pushed = text_to_motion.control_prediction(network, branch, TOLD, control)(NOISE, time)
     np.testing.assert_allclose(pushed, wanted, atol=1e-3)
-    state = sample_control(network, branch, SCHEDULE, TOLD, control, NOISE, sampler="ddim", num_steps=1)
+    state = text_to_motion.sample_control(network, branch, SCHEDULE, TOLD, control, NOISE, sampler="ddim", num_steps=1)
     # One Euler step from the noise along the velocity there.
-    start = control_prediction(network, branch, TOLD, control)(NOISE, jnp.zeros(BATCH))
+    start = text_to_motion.control_prediction(network, branch, TOLD, control)(NOISE, jnp.zeros(BATCH))
     wanted = (NOISE + start) * TOLD.mask[..., None, None]
     np.testing.assert_allclose(state, wanted, atol=1e-3)
-
-
-def test_whole_motions_are_zero_in_padding_and_an_untrained_network_leaves_the_noise():
-    untrained = Compiled(fresh(config_of(depth=1)))
-    state = sample_text(untrained, SCHEDULE, TOLD, NOISE, **EULER)
-    np.testing.assert_allclose(state, NOISE * TOLD.mask[..., None, None], atol=1e-6)  # a velocity of 0
-    assert not np.any(state[1, 6:])
 
 
 # ------------------------------------------------------------------------------------------------------- autoregression
@@ -75,7 +61,7 @@ def test_whole_motions_are_zero_in_padding_and_an_untrained_network_leaves_the_n
 def test_cached_and_uncached_blocks_agree(guidance):
     network = Compiled(stirred(fresh(config_of(depth=2, block_frames=3))))  # the last block is short
     cached, uncached = (
-        sample_blocks(network, SCHEDULE, TOLD, NOISE, guidance=guidance, cached=cached, **EULER)
+        text_to_motion.sample_blocks(network, SCHEDULE, TOLD, NOISE, guidance=guidance, cached=cached, **EULER)
         for cached in (True, False)
     )
     scale = float(jnp.abs(cached).max())
@@ -83,22 +69,10 @@ def test_cached_and_uncached_blocks_agree(guidance):
     assert not np.any(cached[1, 6:])
 
 
-@pytest.mark.slow
-def test_blocks_do_not_depend_on_later_noise_and_need_a_network_with_blocks(network):
-    blocks = Compiled(stirred(fresh(config_of(depth=1, block_frames=4))))
-    first = sample_blocks(blocks, SCHEDULE, TOLD, NOISE, guidance=1.0, **EULER)
-    later = sample_blocks(blocks, SCHEDULE, TOLD, NOISE.at[:, 6].add(1.0), guidance=1.0, **EULER)
-    np.testing.assert_array_equal(later[:, :4], first[:, :4])
-    earlier = sample_blocks(blocks, SCHEDULE, TOLD, NOISE.at[:, 1].add(1.0), guidance=1.0, **EULER)
-    assert float(jnp.abs(earlier[:, 4] - first[:, 4]).max()) > 1e-4
-    with pytest.raises(ValueError, match="build it with block_frames"):
-        sample_blocks(network, SCHEDULE, TOLD, NOISE)
-
-
 def test_a_stream_goes_on_from_its_last_frames_and_hears_new_captions(network):
     prefix, captions = normal(6, BATCH, 3, 5, 4), [normal(7, BATCH, 6), normal(8, BATCH, 6)]
     stream = lambda prefix, captions: list(
-        continue_prefix(network, SCHEDULE, prefix, captions, jax.random.key(1), guidance=1.0, **EULER)
+        text_to_motion.continue_prefix(network, SCHEDULE, prefix, captions, jax.random.key(1), guidance=1.0, **EULER)
     )
     first = stream(prefix, captions)
     assert [made.shape for made in first] == [(BATCH, 5, 5, 4)] * 2
@@ -125,7 +99,7 @@ def test_the_prefix_is_shown_clean_in_every_evaluation():
 
     prefix = normal(6, BATCH, 3, 5, 4)
     captions, asked = [normal(7, BATCH, 6), normal(8, BATCH, 6)], {"guidance": 1.0, "sampler": "ddim", "num_steps": 1}
-    made = list(continue_prefix(Watched(), SCHEDULE, prefix, captions, jax.random.key(1), **asked))
+    made = list(text_to_motion.continue_prefix(Watched(), SCHEDULE, prefix, captions, jax.random.key(1), **asked))
     np.testing.assert_array_equal(seen[0][:, :3], prefix)
     # The second window follows the last three frames of the first, and nothing before them.
     np.testing.assert_array_equal(seen[1][:, :3], made[0][:, -3:])
@@ -137,7 +111,7 @@ def test_the_prefix_is_shown_clean_in_every_evaluation():
 def test_masked_sampling_reveals_every_frame_once():
     """The head of an untrained masked network answers v = 0: every frame is the noise of the round that revealed it."""
     network = fresh(config_of(MaskedACMDMConfig, depth=1))
-    reveal = lambda network, told, **settings: sample_masked(
+    reveal = lambda network, told, **settings: text_to_motion.sample_masked(
         Compiled(network), SCHEDULE, told, jax.random.key(0), **settings, **EULER
     )
     state = np.asarray(reveal(network, TOLD, guidance=1.0, num_rounds=4))

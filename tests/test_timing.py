@@ -6,13 +6,10 @@ import subprocess
 import sys
 import threading
 
-import jax
-import numpy as np
 import pytest
-from builders import refused
 
 from f3amd_companion.speed import machine
-from f3amd_companion.speed.machine import fast_xla_flags, matmul_precision, matmul_probe
+from f3amd_companion.speed.machine import fast_xla_flags
 from f3amd_companion.speed.timing import median_interval, take_turns
 
 
@@ -69,14 +66,6 @@ def test_a_slow_candidate_stops_by_its_seconds_and_the_quick_one_goes_on():
 def test_a_processor_without_a_name_has_that_of_its_kind(tmp_path, monkeypatch):
     monkeypatch.setattr(machine, "Path", lambda name: tmp_path / "none")
     assert machine._processor() == (platform.processor() or platform.machine())
-
-
-def test_matmul_probe_counts_its_operations_and_multiplies():
-    multiply, flops = matmul_probe(size=16)
-    assert flops == 2 * 16 * 16 * 16
-    matrix = np.asarray(jax.random.normal(jax.random.key(0), (16, 16)))
-    np.testing.assert_allclose(np.asarray(multiply()), matrix @ matrix, rtol=1e-4, atol=1e-4)
-    refused("tf32", matmul_precision, "fp8")
 
 
 def test_fast_flags_start_jax_with_as_many_devices(monkeypatch):

@@ -114,14 +114,6 @@ def schedule_time(sigma):
     return (np.cbrt(128.0) - np.cbrt(sigma)) / (np.cbrt(128.0) - np.cbrt(0.01))
 
 
-def test_eq09_training_noise_is_uniform_in_schedule_time():
-    config = TrainingConfig(10)
-    sigma = np.asarray(denoising_task.draw_sigma(jax.random.key(0), 4000, config))
-    time = schedule_time(sigma)
-    counts = np.histogram(time, bins=8, range=(0, 1))[0]
-    assert counts.sum() == 4000 and np.all(np.abs(counts - 500) < 100)
-
-
 def test_mixed_noise_draws_half_of_the_levels_below_one():
     sigma = np.asarray(denoising_task.draw_sigma(jax.random.key(0), 4000, TrainingConfig(10, noise="mixed")))
     # Half log-uniform on [0.01, 1], and of Eq. 9's half those with t > 0.837.
@@ -255,18 +247,6 @@ def test_weights_towards_low_noise_are_those_of_karras_up_to_the_cap():
     weights = np.asarray(denoising_task.noise_weights(sigma, TrainingConfig(10, noise_weighting="low_noise")))
     expected = np.array([6.0, 2.0, 1.0 + 128.0**-2])
     np.testing.assert_allclose(weights, expected / expected.mean(), rtol=1e-6)
-
-
-def test_condition_dropout_hides_history_path_and_style_together():
-    task = tiny_task(condition_dropout=0.5)
-    batch = gather_windows(tiny_windows(), jnp.zeros(64, int), jnp.zeros(64), jnp.zeros(64, int))
-    _, condition = network_inputs(batch, task.normaliser)
-    hidden = task._disturbed(condition, jax.random.key(0))
-    gone = np.array([not np.any(np.asarray(part)) for part in hidden.style])
-    assert 16 < gone.sum() < 48
-    for part, before in zip(hidden, condition, strict=True):
-        assert not np.any(np.asarray(part)[gone])
-        np.testing.assert_array_equal(np.asarray(part)[~gone], np.asarray(before)[~gone])
 
 
 def test_a_gradient_is_clipped_before_adam_sees_it():

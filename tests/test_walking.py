@@ -5,10 +5,9 @@ import pytest
 from builders import SKELETON, refused, wandering_motion
 from f3amd_notebooks import walk_tables
 
-from f3amd_lib.ground.profiles import SHOWN_STYLES
 from f3amd_lib.measures import walking
 from f3amd_lib.motion.root_paths import named_path
-from f3amd_lib.motion.synthetic import style_parameters, synthesize, walk_along
+from f3amd_lib.motion.synthetic import style_parameters, walk_along
 
 WINDOW = 32
 
@@ -111,29 +110,7 @@ def test_each_check_passes_the_source_and_fails_its_nonsense(walk):
         assert check in failed(motion, sources), check
 
 
-@pytest.mark.parametrize("style", SHOWN_STYLES)
-def test_the_source_of_every_shown_style_walks(style):
-    path = named_path("figure-eight", 12 * WINDOW, speed=style_parameters(style).speed)
-    along = walk_along(style, path)
-    free = synthesize(style, seconds=12.0, seed=5)
-    table = walk_tables.check_walks({style: along}, {style: along}, WINDOW)
-    assert table["holds"].all()
-    refused("no source motion of style", walk_tables.check_walks, {style: along}, {"another": along}, WINDOW)
-    rates = [walking.stepping_rate(m.positions, m.skeleton) for m in (along, free)]
-    assert rates[0] == pytest.approx(rates[1], rel=0.35)  # free clips stop and turn
-
-
 # ------------------------------------------------------------- planted feet, bones, frames of a window
-
-
-def feet(sides, rest_on=1.0, stride=0.03):
-    """Positions in which toes rest where `sides` says: -1 right, 1 left, 0 neither, 2 both."""
-    sides = np.asarray(sides)
-    positions = np.zeros((len(sides), SKELETON.num_joints, 3))
-    for toe, own in zip(SKELETON.toes, (1, -1), strict=True):
-        moving = ~np.isin(sides, (own, 2))
-        positions[:, toe, 2] = np.concatenate([[0.0], np.cumsum(stride * moving)[:-1]])
-    return positions
 
 
 def test_a_stiff_figure_swings_nothing_however_it_turns():

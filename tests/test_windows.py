@@ -16,15 +16,7 @@ from builders import (
     tiny_packed,
 )
 
-from f3amd_lib.data.features import (
-    bend_path,
-    center_window,
-    frame_positions,
-    frame_yaw,
-    path_condition,
-    turn_frames,
-    world_frames,
-)
+from f3amd_lib.data import features
 from f3amd_lib.data.windows import (
     Batch,
     build_windows,
@@ -72,7 +64,7 @@ def slices(packed, clips) -> np.ndarray:
     """Every window of some clips by plain slicing, x and z from the last history frame."""
     cut = []
     for motion in clips:
-        world = world_frames(motion)
+        world = features.world_frames(motion)
         for start in range(len(world) - SPAN + 1):
             window = world[start : start + SPAN].copy()
             window[:, [0, 2]] -= window[HISTORY - 1, [0, 2]]
@@ -99,20 +91,6 @@ def test_mirror_images_follow_their_clip_in_training_only(packed, train):
     np.testing.assert_allclose(all_windows(held_out).future, slices(packed, [packed.motion(2)])[:, HISTORY:], atol=1e-6)
     asked = build_windows(packed, "validation", mirrored=True, **SIZES)
     assert asked.num_windows == 2 * held_out.num_windows
-
-
-def test_mirrored_windows_show_the_mirrored_figure(packed, train):
-    count = 30 - SPAN + 1
-    batch = all_windows(train)
-    plain = frame_positions(SKELETON, batch.future[:count])
-    reflected = frame_positions(SKELETON, batch.future[count : 2 * count])
-    twin = np.array(SKELETON.mirror_permutation)
-    expected = np.asarray(plain)[..., twin, :] * [-1.0, 1.0, 1.0]
-    np.testing.assert_allclose(reflected, expected, atol=1e-5)
-    # A mirrored path turns the other way.
-    np.testing.assert_allclose(
-        batch.path[count : 2 * count], batch.path[:count] * np.array([-1, 1, 1, 1, -1, 1, 1, 1]), atol=1e-5
-    )
 
 
 def test_windows_never_straddle_two_clips(packed, train):
@@ -154,8 +132,8 @@ def test_section_3_2_random_facing_turns_everything_alike(train, yaw):
     plain, turned = all_windows(train), all_windows(train, yaw)
     for name in ("history", "future"):
         before, after = getattr(plain, name), getattr(turned, name)
-        expected = frame_positions(SKELETON, before) @ matrix_from_yaw(yaw).T
-        np.testing.assert_allclose(frame_positions(SKELETON, after), expected, atol=2e-5)
+        expected = features.frame_positions(SKELETON, before) @ matrix_from_yaw(yaw).T
+        np.testing.assert_allclose(features.frame_positions(SKELETON, after), expected, atol=2e-5)
         # Local rotations do not turn.
         np.testing.assert_array_equal(after[..., 9:], before[..., 9:])
     np.testing.assert_array_equal(plain.style, turned.style)
@@ -164,19 +142,8 @@ def test_section_3_2_random_facing_turns_everything_alike(train, yaw):
 @pytest.mark.parametrize("yaw", [0.0, -2.5, 3.0])
 def test_section_3_3_captured_path_is_the_future_root(train, yaw):
     batch = all_windows(train, yaw)
-    expected = path_condition(batch.future[..., [0, 2]], frame_yaw(SKELETON, batch.future))
+    expected = features.path_condition(batch.future[..., [0, 2]], features.frame_yaw(SKELETON, batch.future))
     np.testing.assert_allclose(batch.path, expected, atol=2e-5)
-
-
-@pytest.mark.parametrize("smoothing", [1, 2])
-def test_smoothed_paths_turn_with_the_window(train, smoothing):
-    plain, turned = all_windows(train, 0.0, smoothing), all_windows(train, 2.1, smoothing)
-    matrix = matrix_from_yaw(2.1)
-    pad = np.zeros_like(plain.path[..., :1])
-    ground = np.concatenate([plain.path[..., :1], pad, plain.path[..., 1:2]], axis=-1)
-    np.testing.assert_allclose(turned.path[..., :2], (ground @ matrix.T)[..., [0, 2]], atol=1e-5)
-    for column in (slice(2, 5), slice(5, 8)):
-        np.testing.assert_allclose(turned.path[..., column], plain.path[..., column] @ matrix.T, atol=1e-5)
 
 
 def test_smoothing_takes_out_the_sway_of_each_step():
@@ -197,13 +164,13 @@ def sampled(train):
 
 
 def test_section_3_2_facing_of_samples_is_uniform(sampled):
-    yaw = np.asarray(frame_yaw(SKELETON, sampled.history[:, -1]))
+    yaw = np.asarray(features.frame_yaw(SKELETON, sampled.history[:, -1]))
     counts = np.histogram(yaw, bins=4, range=(-np.pi, np.pi))[0]
     assert counts.sum() == 512 and np.all((counts > 90) & (counts < 170))
 
 
 def test_half_of_the_samples_show_the_captured_path(sampled):
-    captured = path_condition(sampled.future[..., [0, 2]], frame_yaw(SKELETON, sampled.future))
+    captured = features.path_condition(sampled.future[..., [0, 2]], features.frame_yaw(SKELETON, sampled.future))
     same = np.abs(np.asarray(sampled.path - captured)).max(axis=(1, 2)) < 1e-4
     assert 0.4 < same.mean() < 0.6
 
@@ -245,14 +212,14 @@ def test_normaliser_makes_training_features_standard(train):
 
 def test_bent_path_by_hand():
     path = np.array([[[1.0, 0.0], [2.0, 0.0], [3.0, 0.0], [4.0, 0.0]]])
-    bent = bend_path(path, np.array([[0.0, 0.8]]))
+    bent = features.bend_path(path, np.array([[0.0, 0.8]]))
     np.testing.assert_allclose(bent, [[[1.0, 0.2], [2.0, 0.4], [3.0, 0.6], [4.0, 0.8]]])
 
 
 def restarted(offset):
     """Captured windows, and what they become if the whole history is off by `offset`."""
     frames = jnp.asarray(random_frames((2, SPAN)), jnp.float32)
-    frames = center_window(frames, frames[:, HISTORY - 1, jnp.array([0, 2])])
+    frames = features.center_window(frames, frames[:, HISTORY - 1, jnp.array([0, 2])])
     path = np.random.default_rng(0).standard_normal((2, WINDOW, 8)).astype(np.float32)
     batch = Batch(frames[:, :HISTORY], frames[:, HISTORY:], jnp.asarray(path), jnp.eye(2))
     history = batch.history + jnp.asarray(offset, jnp.float32)
@@ -276,7 +243,7 @@ def test_restarting_bends_target_and_path_back_to_the_captured_line():
 
 def test_mean_poses_by_hand(packed, train):
     motions = [packed.motion(0), mirror(packed.motion(0)), packed.motion(1), packed.motion(3)]
-    firsts = [world_frames(m)[: m.num_frames - SPAN + 1, 9:] for m in motions]
+    firsts = [features.world_frames(m)[: m.num_frames - SPAN + 1, 9:] for m in motions]
     expected = [np.concatenate(firsts[:2]).mean(axis=0), np.concatenate(firsts[2:]).mean(axis=0)]
     np.testing.assert_allclose(mean_poses(train), expected, atol=1e-5)
 
@@ -287,9 +254,9 @@ def test_starting_poses_stand_at_the_origin_and_face_forward(packed):
     for cuts in starts.values():
         assert cuts.shape[1:] == (HISTORY, CHANNELS) and cuts.dtype == np.float32
         np.testing.assert_allclose(cuts[:, -1, [0, 2]], 0.0, atol=1e-7)
-        np.testing.assert_allclose(wrap_angle(frame_yaw(SKELETON, cuts[:, -1])), 0.0, atol=1e-6)
+        np.testing.assert_allclose(wrap_angle(features.frame_yaw(SKELETON, cuts[:, -1])), 0.0, atol=1e-6)
     # From the middle of clip 0 (30 frames): frames 11 to 14, turned and moved.
-    world = world_frames(packed.motion(0))[11:15]
-    back = turn_frames(starts["calm"][0].astype(float), frame_yaw(SKELETON, world[-1]))
+    world = features.world_frames(packed.motion(0))[11:15]
+    back = features.turn_frames(starts["calm"][0].astype(float), features.frame_yaw(SKELETON, world[-1]))
     back[:, [0, 2]] += world[-1, [0, 2]]
     np.testing.assert_allclose(back, world, atol=1e-5)

@@ -9,22 +9,12 @@ import dataclasses
 import types
 from typing import ClassVar
 
+import builders
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from builders import (
-    CHANNELS,
-    HISTORY,
-    SKELETON,
-    WINDOW,
-    packed_from,
-    tiny_packed,
-    tiny_task,
-    tiny_trained,
-    tiny_windows,
-)
 from builders import wandering_motion as wandering
 
 from f3amd_companion.measuring import campaign
@@ -56,7 +46,7 @@ class Seen:
 
 @pytest.fixture
 def task():
-    return tiny_task()
+    return builders.tiny_task()
 
 
 @pytest.fixture
@@ -97,7 +87,7 @@ def test_the_loss_is_given_network_units_metres_and_the_last_history_frame(task,
     np.testing.assert_allclose(x0, normaliser.normalise(batch.future), atol=1e-6)
     np.testing.assert_allclose(future_hat, normaliser.denormalise(x0_hat), atol=1e-5)
     np.testing.assert_array_equal(future, batch.future)
-    np.testing.assert_array_equal(last, batch.history[:, HISTORY - 1])
+    np.testing.assert_array_equal(last, batch.history[:, builders.HISTORY - 1])
     # The frames told apart here do differ, or the lines above would show nothing.
     assert np.abs(batch.history[:, -1] - batch.history[:, 0]).max() > 0.05
     assert np.abs(normaliser.denormalise(x0_hat) - x0_hat).max() > 0.05
@@ -189,13 +179,13 @@ def _two_kinds(state_of):
 
 @pytest.fixture
 def prepared():
-    return PreparedData(tiny_packed(), WINDOW, HISTORY)
+    return PreparedData(builders.tiny_packed(), builders.WINDOW, builders.HISTORY)
 
 
 @pytest.fixture
 def untrained(monkeypatch, prepared):
     """A loop that trains nothing and returns weights of ones with a moving average of twos."""
-    task = tiny_task(num_steps=4)
+    task = builders.tiny_task(num_steps=4)
     monkeypatch.setattr(PreparedData, "task", lambda self, *args, **settings: task)
     done = _two_kinds(types.SimpleNamespace(params={"a": jnp.ones(3)}))
     monkeypatch.setattr(pipeline, "optimise", lambda *args, **settings: (done, []))
@@ -215,7 +205,10 @@ def test_the_moving_average_is_what_a_snapshot_returns(untrained, prepared, monk
     monkeypatch.setattr(campaign, "held_out_terms", lambda task, state, windows: {"loss": 0.0})
     written = {}
     monkeypatch.setattr(campaign, "save_model", lambda path, trained, dtype: written.update(trained.params))
-    run, how = campaign.Run("F3AMD-FNO-96", window=WINDOW), {"precision": "float32", "stop_at": None, "progress": False}
+    run, how = (
+        campaign.Run("F3AMD-FNO-96", window=builders.WINDOW),
+        {"precision": "float32", "stop_at": None, "progress": False},
+    )
     windows = 4 * untrained.config.batch_size
     _, trained, *_ = campaign._trained(prepared, run, windows, batch_size=2, record={}, folder=tmp_path, **how)
     for params in (trained.params, written):
@@ -242,7 +235,7 @@ def test_windows_of_a_split_come_from_its_clips_alone():
     for number, split in enumerate((0, 0, 1, 2)):
         motion = wandering(24, number)
         clips.append((motion.replace(root_position=motion.root_position + [far[split], 0.0, 0.0]), number % 2, split))
-    prepared = PreparedData(packed_from(clips), WINDOW, HISTORY)
+    prepared = PreparedData(builders.packed_from(clips), builders.WINDOW, builders.HISTORY)
     for number, split in enumerate(("train", "validation", "test")):
         x = np.asarray(prepared.windows(split).frames[:, 0])
         assert (np.abs(x - far[number]) < 50.0).all()
@@ -250,8 +243,8 @@ def test_windows_of_a_split_come_from_its_clips_alone():
 
 
 def test_held_out_windows_are_not_mirrored_and_training_windows_are():
-    train, held_out = tiny_windows("train"), tiny_windows("validation")
-    packed = tiny_packed()
+    train, held_out = builders.tiny_windows("train"), builders.tiny_windows("validation")
+    packed = builders.tiny_packed()
     lengths = np.diff(packed.clip_start)
     assert len(train.frames) == lengths[0] * 2 + lengths[1] + lengths[3]  # "calm" may be mirrored
     assert len(held_out.frames) == lengths[2]
@@ -260,7 +253,7 @@ def test_held_out_windows_are_not_mirrored_and_training_windows_are():
 class Told:
     """A network that writes its condition into the height: the style, where the path ends, the last pose's height."""
 
-    config = types.SimpleNamespace(window=WINDOW, channels=CHANNELS)
+    config = types.SimpleNamespace(window=builders.WINDOW, channels=builders.CHANNELS)
 
     def encode(self, condition):
         return condition
@@ -269,7 +262,7 @@ class Told:
         height = jnp.argmax(condition.style, axis=-1) + 1.0
         frames = jnp.zeros_like(x_noisy).at[..., 1].set(height[:, None])
         frames = frames.at[..., 0].set(condition.path[..., 0]).at[..., 2].set(condition.path[..., 1])
-        pose = jnp.tile(jnp.array([1.0, 0, 0, 0, 1, 0]), SKELETON.num_joints)
+        pose = jnp.tile(jnp.array([1.0, 0, 0, 0, 1, 0]), builders.SKELETON.num_joints)
         return frames.at[..., 3:].set(pose)
 
 
@@ -280,11 +273,11 @@ def first(style, members, counts):
 
 @pytest.mark.parametrize("together", [True, False])
 def test_everybody_in_a_rollout_has_their_own_style_and_path(monkeypatch, together):
-    trained = dataclasses.replace(tiny_trained(), normaliser=Normaliser.identity(CHANNELS))
+    trained = dataclasses.replace(builders.tiny_trained(), normaliser=Normaliser.identity(builders.CHANNELS))
     monkeypatch.setattr(type(trained), "network", lambda self: Told())
     generator = MotionGenerator(trained, num_steps=1)
     styles = ["calm", "proud", "proud", "calm"]
-    paths = [named_path(name, 2 * WINDOW) for name in ("straight", "circle", "spiral", "slalom")]
+    paths = [named_path(name, 2 * builders.WINDOW) for name in ("straight", "circle", "spiral", "slalom")]
     if together:
         frames = generator.rollout(paths, styles, seed=0).frames
     else:  # a key each, as in a crowd
@@ -293,13 +286,13 @@ def test_everybody_in_a_rollout_has_their_own_style_and_path(monkeypatch, togeth
         history = starting_poses(trained, trained_index, np.zeros((4, 2)), yaw[:, 0], np.ones(4), first)
         keys = jax.random.split(jax.random.key(0), 4)
         frames = generator.generate(position, yaw, np.array(trained_index), history, keys)
-    np.testing.assert_allclose(frames[..., 1], np.array([1, 2, 2, 1])[:, None] * np.ones(2 * WINDOW))
+    np.testing.assert_allclose(frames[..., 1], np.array([1, 2, 2, 1])[:, None] * np.ones(2 * builders.WINDOW))
     for frame, path in zip(frames, paths, strict=True):
         np.testing.assert_allclose(frame[-1, [0, 2]], path.position[-1], atol=1e-4)
 
 
 def test_each_style_starts_from_a_pose_of_its_own():
-    trained = tiny_trained()
+    trained = builders.tiny_trained()
     poses = starting_poses(trained, [1, 0], np.zeros((2, 2)), np.zeros(2), np.full(2, 0.04), first)
     for pose, style in zip(poses, ("proud", "calm"), strict=True):
         heights = [start[:, 1] for start in trained.start_poses[style]]
@@ -309,9 +302,9 @@ def test_each_style_starts_from_a_pose_of_its_own():
 
 
 def test_reference_clips_of_a_split_are_of_that_split():
-    packed = packed_from([(wandering(80, number), number % 2, number // 2) for number in range(6)])
+    packed = builders.packed_from([(wandering(80, number), number % 2, number // 2) for number in range(6)])
     for number, split in enumerate(("train", "validation", "test")):
-        clips = real_clips.reference_clips(packed, packed.styles, window=WINDOW, split=split)
+        clips = real_clips.reference_clips(packed, packed.styles, window=builders.WINDOW, split=split)
         assert sorted(clips) == [2 * number, 2 * number + 1]
 
 
@@ -323,10 +316,10 @@ def test_a_facing_that_flips_and_comes_back_is_smoothed_the_short_way():
     cosine, sine = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
     matrix[:, 0, 0], matrix[:, 0, 2], matrix[:, 1, 1] = cosine, sine, 1.0
     matrix[:, 2, 0], matrix[:, 2, 2] = -sine, cosine
-    rotations = np.broadcast_to(np.eye(3), (60, SKELETON.num_joints, 3, 3)).copy()
+    rotations = np.broadcast_to(np.eye(3), (60, builders.SKELETON.num_joints, 3, 3)).copy()
     rotations[:, 0] = matrix
     world = world_frames(motion.replace(rotations=rotations))
-    raw, *smoothed = windows_module._path_variants(SKELETON, world)
+    raw, *smoothed = windows_module._path_variants(builders.SKELETON, world)
     np.testing.assert_allclose(raw[:, 2:], np.stack([sine, cosine], axis=1), atol=1e-9)
     for variant in smoothed:
         np.testing.assert_allclose(np.hypot(variant[:, 2], variant[:, 3]), 1.0, atol=1e-9)
