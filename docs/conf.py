@@ -14,7 +14,7 @@ import tomllib
 from pathlib import Path
 
 DOCS = Path(__file__).resolve().parent
-sys.path[:0] = [str(DOCS / "_ext"), str(DOCS.parent)]
+sys.path[:0] = [str(DOCS / "_ext"), str(DOCS.parent), str(DOCS.parent / "notebooks")]
 os.environ.setdefault("JAX_PLATFORMS", "cpu")  # autodoc imports the library; it computes nothing
 
 from pages import launch_options  # noqa: E402 (the lines above are what finds it)

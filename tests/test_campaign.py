@@ -96,7 +96,7 @@ def test_a_recipe_with_a_batch_of_its_own_sees_as_many_windows_in_other_steps(pa
         return SimpleNamespace(step=0), None
 
     monkeypatch.setattr(campaign, "train_in_legs", look)
-    monkeypatch.setattr(campaign, "compile_steps", lambda *_: None)
+    monkeypatch.setattr(campaign, "compiled_steps", lambda *_: None)
     prepared = PreparedData(packed, 32, 10)
     how = {"batch_size": 128, "folder": tmp_path, "progress": False}
     for each in (run, Run("F3AMD-FNO-96")):
@@ -115,7 +115,7 @@ def test_training_multiplies_in_the_precision_asked_for(packed, monkeypatch, tmp
         return SimpleNamespace(step=0), None
 
     monkeypatch.setattr(campaign, "train_in_legs", look)
-    monkeypatch.setattr(campaign, "compile_steps", lambda *_: None)
+    monkeypatch.setattr(campaign, "compiled_steps", lambda *_: None)
     monkeypatch.setattr(campaign, "check_precision", lambda precision: None)  # as on a GPU
     how = {"snapshots": [(SEEDED, 10_240)], "folder": tmp_path, "precision": precision}
     assert [state for *_, state in run_campaign(PreparedData(packed, 32, 10), PROFILE, **how)] == ["unfinished"]

@@ -122,7 +122,7 @@ def test_queue_and_plan_hold_each_reading_beside_camdms_units():
 def test_a_package_keeps_weights_that_are_measured_elsewhere(packed, judges, small, tmp_path, monkeypatch):  # noqa: F811
     monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path / "results"))
     monkeypatch.setattr(fingerprint, "NUM_FRAMES", 66)
-    monkeypatch.setattr(campaign, "compile_steps", lambda *_: None)
+    monkeypatch.setattr(campaign, "compiled_steps", lambda *_: None)
     snapshots = [(Run("F3AMD-FNO-32", length=1), 8), (Run("F3AMD-FNO-32", seed=1), 8)]
     how = {"folder": tmp_path, "batch_size": 4, "progress": False}
     states = list(run_campaign(PreparedData(packed, 32, 10), PROFILE, snapshots=snapshots[:1], **how))

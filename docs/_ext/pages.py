@@ -382,8 +382,9 @@ def plain_lines(lines: list[str]) -> list[str]:
 
 def equations(docstring: str) -> list[str]:
     """Return, as reStructuredText, the equations that a docstring names: what each says, and its formula as printed."""
-    from f3amd_companion.ledger.equation_map import mentioned_equations  # here: most pages have none
-    from f3amd_lib.ground.papers import load_paper_file
+    from f3amd_notebooks.equation_map import mentioned_equations
+
+    from f3amd_lib.ground.papers import load_paper_file  # here: most pages have none
 
     lines, mentioned = [], mentioned_equations(docstring)
     for folder in sorted({paper for paper, _ in mentioned}):
