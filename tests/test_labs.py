@@ -57,7 +57,7 @@ def test_a_stub_is_not_yet_and_nobody_falls_over_nonsense(number, capsys):
         assert judge(number, nothing, 0).fault
 
 
-@pytest.mark.parametrize("seed", [1, 20, 300])
+@pytest.mark.parametrize("seed", [1, 20])
 @pytest.mark.parametrize("number", LABS)
 def test_a_solution_passes_whatever_is_drawn(number, seed):
     found = judge(number, of(number)["answer"], seed)
