@@ -174,7 +174,7 @@ def test_a_command_is_understood(run, monkeypatch):
     elif what == "training":
         assert called == [window] and status == 0
     elif command == "bench":
-        assert called == [[what]]
+        assert called == [(what,)]
     else:
         assert [name for name, *_ in called] == (["trained", "walking"] if what == "trained" else [what])
         for _, used, given, extra in called:

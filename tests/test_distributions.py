@@ -108,7 +108,7 @@ def test_drawn_windows_are_windows_of_each_style_each_once():
     assert {tuple(row) for row in drawn[12:]} <= {tuple(row) for row in clouds["proud"]}
     np.testing.assert_array_equal(drawn, d.draw_per_style(clouds, 12, np.random.default_rng(3)))
     assert len(d.draw_per_style(clouds, 15, np.random.default_rng(3))) == 30
-    refused("16 windows of style 'proud' are wanted, of 15", d.draw_per_style, clouds, 16, np.random.default_rng(3))
+    refused("style 'proud' has 15 windows, 16 are needed", d.draw_per_style, clouds, 16, np.random.default_rng(3))
 
 
 # ----------------------------------------------------------------------------------------- styles

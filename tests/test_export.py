@@ -197,7 +197,7 @@ def test_a_file_cut_short_or_altered_is_refused(jax_folder, tmp_path):
     refused(f"{file}: content does not match its checksum", load_artefact, copy, runtime="jax")
     refused(f"{file}: content does not match its checksum", load_artefact, copy, runtime="jax")
     (copy / file).unlink()
-    refused(f"{file}: no such file, but manifest.json speaks of it", load_artefact, copy, runtime="jax")
+    refused(f"{file}: is missing, although manifest.json lists this file", load_artefact, copy, runtime="jax")
 
 
 def test_a_garbled_or_altered_manifest_is_refused(jax_folder, tmp_path):

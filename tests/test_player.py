@@ -243,7 +243,7 @@ def test_a_rollout_becomes_a_scene():
 def test_what_cannot_be_shown_is_refused_by_name():
     motion, short = wandering_motion(FRAMES), wandering_motion(FRAMES - 1, 1)
     refused("at least one scene", player_page, [])
-    refused("is 'walk'", player_page, [motion, "walk"])
+    refused("cannot show 'walk'", player_page, [motion, "walk"])
     refused("wandering 1: .* 39 frames at 30 .* 40 frames", player_page, [motion, short])
     refused("the player needs rotations", player_page, Motion.from_positions(SKELETON, motion.positions))
     root = np.array(motion.root_position)

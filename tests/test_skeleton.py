@@ -227,7 +227,7 @@ def test_broken_skeletons_are_refused(changes, message):
 def test_unknown_joints_and_roles_list_what_there_is():
     refused("no joint 'Tail'; it has Hips, LeftHip", legs().index, "Tail")
     rig = Skeleton(("Base",), (-1,), np.zeros((1, 3)))
-    with pytest.raises(ValueError, match=r"known as its left_toe; .*: Base"):
+    with pytest.raises(ValueError, match=r"no joint has the role left_toe; .*: Base"):
         _ = rig.toes
 
 
@@ -274,7 +274,7 @@ def test_motion_of_positions_alone_is_where_the_same_motion_with_rotations_is(ch
 def test_what_needs_rotations_refuses_positions_alone_and_says_so(act):
     whole = synthesize("Neutral", 0.5)
     act(whole)
-    with pytest.raises(ValueError, match="'bare' has positions alone: .* needs rotations"):
+    with pytest.raises(ValueError, match="'bare' has only positions: .* needs rotations"):
         act(Motion.from_positions(whole.skeleton, whole.positions, name="bare"))
 
 

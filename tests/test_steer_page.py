@@ -243,7 +243,7 @@ def test_the_page_carries_everything_and_asks_for_nothing(trained, packages, tmp
     assert data["card"]["legs"] is None and 'id="feet" disabled' in page  # legs of these are no legs
     assert data["card"]["styles"] == ["calm", "proud"] and data["card"]["window"] == builders.WINDOW
     assert set(files) == {"worker", "wasm", "program", "poses"}
-    assert set(modules) == {"core", "three", "motion", "network", "steer"}
+    assert set(modules) == {"body", "core", "three", "motion", "network", "steer"}
     head = page.split('<script type="application/json" id="steer-data">')[0]
     assert "http" not in head.replace("http-equiv", "") and "default-src 'none'" in head
     assert "&lt;nobody&gt;" in head and "CC0" in head and "inertialised" in head
@@ -269,4 +269,4 @@ def test_a_package_that_is_not_as_pinned_is_refused_with_its_place(monkeypatch, 
         raise OSError("no network")
 
     monkeypatch.setattr(steer.pooch.core, "stream_download", offline)
-    refused("put that file at .*three-0.187.0.tgz", package_file, "three", "build/three.module.js")
+    refused("save this file as .*three-0.187.0.tgz", package_file, "three", "build/three.module.js")

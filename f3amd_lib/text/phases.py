@@ -7,6 +7,8 @@ Source: MotionPCM section 3, section 4.2 and Appendix A.1 (Jiang et al. 2025), a
 consistency, its baseline (Dai et al. 2024).
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from typing import NamedTuple
 

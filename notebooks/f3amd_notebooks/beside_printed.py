@@ -1,9 +1,8 @@
 """A paper's table with ours beside it, and what to know before comparing them."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import pandas as pd
-from f3amd_companion.speed.speed_tables import fastest_implementations
 from f3amd_lib.ground.papers import has_paper_file, load_paper_file, load_paper_table, paper_folders
 from f3amd_lib.ground.profiles import runs_dir
 from f3amd_lib.ground.records import read_table
@@ -145,18 +144,19 @@ def training_beside_paper(table: pd.DataFrame) -> pd.DataFrame:
     return joined
 
 
-def speedups_by_turns(times: pd.DataFrame) -> pd.DataFrame:
+def speedups_by_turns(times: pd.DataFrame, fastest: Callable) -> pd.DataFrame:
     """Return the speedups over CAMDM of our own rounds, both from the same turns.
 
     Args:
       times: `synthesis_ways`; JAX's rows count.
+      fastest: keeps one implementation of each (`speed_tables.fastest_implementations`).
 
     Returns:
-      As `speedups`; what two suites have timed counts once, as in `fastest_implementations`.
+      As `speedups`; what two suites have timed counts once.
     """
     suites = sorted(set(times["suite"]), key=lambda name: (name == "bars", name != "main"))
     times = times[times["framework"] == "jax"]
-    tables = [speedups(fastest_implementations(times[times["suite"] == suite])) for suite in suites]
+    tables = [speedups(fastest(times[times["suite"] == suite])) for suite in suites]
     keys = ["model", "window_frames", "steps", "device", "characters"]
     return pd.concat(tables).drop_duplicates(keys).reset_index(drop=True)
 
