@@ -60,7 +60,7 @@ def main() -> None:
                    "--output-dir", str(Path(sys.argv[1], "lite").resolve()), "--apps", "lab", "--apps", "notebooks",
                    "--no-sourcemaps", "--no-unused-shared-packages"]  # fmt: skip
         command = [sys.executable, "-m", "jupyterlite_core", "build", *options]
-        made = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        made = subprocess.run(command, cwd=name, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
         if made.returncode:
             sys.exit(made.stdout)
 
