@@ -30,15 +30,17 @@ def address() -> str:
 
 
 def with_cell(text: str) -> str:
-    """Return a notebook's file with the cell."""
+    """Return a notebook's file with the cell, counted as one run from top to bottom counts."""
     notebook = json.loads(text)
     is_ours = lambda cell: "install" in cell["metadata"].get("tags", [])
     cells = [cell for cell in notebook["cells"] if not is_ours(cell)]
-    count = next((cell["execution_count"] for cell in notebook["cells"] if is_ours(cell)), None)
     metadata = {"jupyter": {"source_hidden": True}, "tags": ["hide-input", "install", "remove-cell"]}
     source = CODE.replace("ADDRESS", address()).splitlines(keepends=True)
-    ours = {"cell_type": "code", "execution_count": count, "id": "install", "metadata": metadata, "outputs": []}
+    ours = {"cell_type": "code", "execution_count": 1, "id": "install", "metadata": metadata, "outputs": []}
     cells.insert(1, ours | {"source": source})
+    for count, cell in enumerate((cell for cell in cells if cell["cell_type"] == "code"), 1):
+        for numbered in (cell, *(output for output in cell["outputs"] if "execution_count" in output)):
+            numbered["execution_count"] = count
     return json.dumps(notebook | {"cells": cells}, indent=1, ensure_ascii=False) + "\n"
 
 

@@ -6,6 +6,7 @@ nbval checks that the notebooks still compute what they show; here is what it ca
 import ast
 import base64
 import io
+import json
 import re
 import subprocess
 from pathlib import Path
@@ -69,9 +70,8 @@ def notebook_faults(path: Path, *, numbered: bool = True) -> list[str]:
     code = [cell for cell in notebook.cells if cell.cell_type == "code"]
     if any(not cell.source.strip() for cell in code):
         faults.append("empty code cell")
-    # The cell that installs need not have run: it does something on Colab alone.
-    counts = [cell.execution_count for cell in code if "install" not in tags_of(cell)]
-    if counts[0] not in (1, 2) or counts != list(range(counts[0], counts[0] + len(counts))):
+    counts = [cell.execution_count for cell in code]
+    if counts != list(range(1, len(code) + 1)):
         faults.append(f"execution counts {counts} are not those of one run from top to bottom")
     if any(output.output_type == "error" for cell in code for output in cell.outputs):
         faults.append("error output")
@@ -232,3 +232,118 @@ def test_a_cut_off_picture_is_found(tmp_path, margin, expected):
 
 def test_repository_holds_nothing_it_should_not():
     assert repository_faults(tracked_files(), ROOT) == []
+
+
+# The checks themselves, on a notebook that is right and on ones that are wrong in one way.
+
+
+def good_notebook() -> dict:
+    """A notebook that passes, as the JSON of its file."""
+    parameters = nbformat.v4.new_code_cell('profile = "smoke"\ndata = "synthetic"\nseed = 0')
+    parameters.metadata["tags"] = ["parameters"]
+    parameters.execution_count = 1
+    verdict = nbformat.v4.new_code_cell("print('agrees')")
+    verdict.metadata["tags"] = ["nbval-check-output"]
+    verdict.execution_count = 2
+    verdict.outputs = [nbformat.v4.new_output("stream", text="agrees\n")]
+    notebook = nbformat.v4.new_notebook(cells=[parameters, verdict])
+    notebook.metadata["kernelspec"] = {"name": "python3", "display_name": "Python 3"}
+    return json.loads(nbformat.writes(notebook))
+
+
+def save(folder: Path, notebook: dict, name: str = "00_good.ipynb") -> Path:
+    path = folder / name
+    path.write_text(json.dumps(notebook), encoding="utf-8")
+    return path
+
+
+def test_a_good_notebook_has_no_faults(tmp_path):
+    notebook = good_notebook()
+    notebook["cells"].append(said(r"Divided by $\alpha_t$: two lines, $$a \\ b$$."))
+    assert notebook_faults(save(tmp_path, notebook)) == []
+    notebook["cells"][1]["source"] = "print('agrees')\nkeep_figure(figure, results, 'name');"
+    assert notebook_faults(save(tmp_path, notebook)) == []
+
+
+def set_parameters(source):
+    return lambda notebook: notebook["cells"][0].update(source=source)
+
+
+def set_verdict(**changes):
+    return lambda notebook: notebook["cells"][1].update(changes)
+
+
+def said(source):
+    """A cell of text."""
+    return {"cell_type": "markdown", "metadata": {}, "source": source, "id": "said"}
+
+
+ERROR_OUTPUT = {"output_type": "error", "ename": "E", "evalue": "", "traceback": []}
+ELSEWHERE = "/" + "home/somebody/motion.bvh"
+
+
+@pytest.mark.parametrize(
+    "spoil, fault",
+    [
+        (set_verdict(execution_count=None), "execution counts"),
+        (set_verdict(execution_count=3), "execution counts"),
+        (set_verdict(outputs=[ERROR_OUTPUT]), "error output"),
+        (set_verdict(outputs=[]), "has no output to check"),
+        (set_verdict(metadata={}), "no cell is tagged nbval-check-output"),
+        (set_verdict(source=f"open('{ELSEWHERE}')"), "absolute path"),
+        (set_verdict(source="x" * LARGEST_NOTEBOOK), "limit 250000"),
+        (set_verdict(source="import numpy as np\n" * 12 + "use_style()"), "13 lines of code before the story"),
+        (set_verdict(metadata={"tags": ["hide-input", "nbval-check-output"]}), "folded on the site or in JupyterLab"),
+        (set_verdict(source="  "), "empty code cell"),
+        (set_verdict(source="keep_figure(figure, results, 'name')\ntable"), "drawn and not shown: keep_figure(figure"),
+        (lambda notebook: notebook["cells"].append(said(r"Divided by $\\alpha_t$.")), r"\\alpha ends a line"),
+        (set_verdict(metadata={"papermill": {}}), "papermill metadata"),
+        (lambda notebook: notebook["metadata"].update(papermill={}), "papermill metadata"),
+        (lambda notebook: notebook["metadata"].update(widgets={}), "widget state"),
+        (lambda notebook: notebook["metadata"]["kernelspec"].update(name="my-env"), "kernel is not python3"),
+        (set_parameters('profile = "laptop"\ndata = "synthetic"'), "profile is not 'smoke'"),
+        (set_parameters('profile = "smoke"\ndata = "bandai"'), "data is not 'synthetic'"),
+        (
+            set_parameters('profile = "smoke"\ndata = "synthetic"\nrounds = 2 * 40'),
+            "more than literals: 'rounds = 2 * 40'",
+        ),
+        (set_parameters('import os\nprofile = "smoke"\ndata = "synthetic"'), "more than literals: 'import os'"),
+        (lambda notebook: notebook["cells"][0]["metadata"].update(tags=[]), "0 cells are tagged parameters"),
+    ],
+)
+def test_each_fault_of_a_notebook_is_found(tmp_path, spoil, fault):
+    notebook = good_notebook()
+    spoil(notebook)
+    assert any(fault in found for found in notebook_faults(save(tmp_path, notebook)))
+
+
+def test_a_standalone_notebook_needs_no_number_and_no_parameters(tmp_path):
+    notebook = good_notebook()
+    set_parameters("import numpy")(notebook)
+    notebook["cells"][0]["metadata"].update(tags=[])
+    path = save(tmp_path, notebook, "anything.ipynb")
+    assert notebook_faults(path, numbered=False) == []
+    set_verdict(execution_count=3)(notebook)
+    (fault,) = notebook_faults(save(tmp_path, notebook, "anything.ipynb"), numbered=False)
+    assert "execution counts" in fault
+
+
+@pytest.mark.parametrize(
+    "name, content, fault",
+    [
+        ("walk.bvh", "HIERARCHY", "motion data"),
+        ("paper_figures/bandai/laptop/tables/walk.bvh", "HIERARCHY", "motion data"),
+        ("paper_figures/bandai/laptop/media/walk.zip", "", "motion data"),
+        ("paper_figures/copy.ipynb", "{}", "notebooks lie in"),
+        ("notebooks/drafts/copy.ipynb", "{}", "notebooks lie in"),
+        ("notes.md", f"see {ELSEWHERE}", "path of a machine"),
+        ("large.npz", "x" * (LARGEST_FILE + 1), "limit 5000000"),
+        ("f3amd_lib/pretrained/large.npz", "x" * (LARGEST_FILE + 1), "limit 5000000"),
+    ],
+)
+def test_each_fault_of_the_repository_is_found(tmp_path, name, content, fault):
+    path = tmp_path / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(content)
+    (found,) = repository_faults([path], tmp_path)
+    assert found.startswith(name) and fault in found
