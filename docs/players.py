@@ -8,31 +8,44 @@ Pages that the site links to are those of `pages.PLAYERS`.
 
 from __future__ import annotations
 
+import os
 import shutil
 import sys
 import tempfile
 from pathlib import Path
 
 DOCS = Path(__file__).resolve().parent
-sys.path[:0] = [str(DOCS / "_ext"), str(DOCS.parent)]
+sys.path[:0] = [str(DOCS / "_ext"), str(DOCS.parent), str(DOCS.parent / "scripts")]
 
 import pages  # noqa: E402 (the line above is what finds it)
+import side_by_side  # noqa: E402
 
 from f3amd_companion.__main__ import main as command  # noqa: E402
 from f3amd_companion.serving.player import Scene, write_player  # noqa: E402
 from f3amd_companion.serving.steer import write_steer  # noqa: E402
-from f3amd_lib.ground.profiles import find_model  # noqa: E402
+from f3amd_lib.data.sources import DATA_DIR_VARIABLE  # noqa: E402
+from f3amd_lib.ground.profiles import find_model, load_profile  # noqa: E402
 from f3amd_lib.motion.bvh import read_bvh  # noqa: E402
+from f3amd_lib.motion.skeleton import resample  # noqa: E402
 from f3amd_lib.training.checkpoints import load_model  # noqa: E402
+from f3amd_lib.training.pipeline import prepare  # noqa: E402
 
 CROWD = ("--characters", "64", "--seconds", "8", "--plan", "--pictures")
 
 
 def write_first(site: Path) -> None:
-    """Write the walk of the first page: a real clip, and what our recipe makes of its first frames and its path."""
-    folder = pages.ROOT / "paper_figures" / "bandai" / "laptop"
-    titles = {"real": "A real clip", "steady": "F3AMD-FNO-96-steady, ours: 8 steps a window"}
-    walks = [Scene(read_bvh(folder / f"media/side_by_side_{name}.bvh"), title=titles[name]) for name in titles]
+    """Write the walk of the first page: what our recipe makes of a real clip's first frames and path.
+
+    The clip itself is no part of the repository: it walks beside it where F3AMD_DATA_DIR says where the data are.
+    """
+    folder, model = pages.ROOT / "paper_figures" / "bandai" / "laptop", side_by_side.SYSTEMS[0][0]
+    walks = [Scene(read_bvh(folder / "media/side_by_side_steady.bvh"), title=f"{model}, ours: 8 steps a window")]
+    if os.environ.get(DATA_DIR_VARIABLE):
+        packed = prepare(load_profile("laptop", "bandai")).packed
+        real = side_by_side.followed(
+            packed, load_model(side_by_side.PRETRAINED_DIR / f"bandai/{model}.safetensors").config
+        )[-1]
+        walks.insert(0, Scene(resample(real, side_by_side.FPS), title="A real clip"))
     write_player(site / "players" / "first.html", walks, strip=False, credit=pages.credit_line(folder))
 
 

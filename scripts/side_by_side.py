@@ -1,6 +1,7 @@
 """Draw the README's moving picture: a real clip and three generated walks on its path, abreast on one floor.
 
-The first two are written as BVH, too: the site's first page plays them (`docs/players.py`).
+The second is written as BVH, too, for the site's first page (`docs/players.py`), which puts the real clip beside it where
+the data are.
 
     python scripts/side_by_side.py      (needs the data set bandai: downloaded, or in F3AMD_DATA_DIR)
 
@@ -45,12 +46,16 @@ WIDTH = 960  # pixels
 LANE = 1.8  # metres between neighbours
 
 
+def followed(packed, config) -> tuple:
+    """Return what `follow_clip` does of the clip, for a network with these windows."""
+    clip = [packed.motion(k).name for k in range(len(packed.clip_style))].index(CLIP)
+    num_frames = (packed.motion(clip).num_frames - config.num_history) // config.window * config.window
+    return follow_clip(packed, clip, num_history=config.num_history, num_frames=num_frames)
+
+
 def walks(packed, models) -> tuple[dict, np.ndarray]:
     """Return motions by label, at `FPS`, and the line on the ground that all of them follow, [T, 2]."""
-    clip = [packed.motion(k).name for k in range(len(packed.clip_style))].index(CLIP)
-    config = models[SYSTEMS[0][0]].config
-    num_frames = (packed.motion(clip).num_frames - config.num_history) // config.window * config.window
-    history, path, real = follow_clip(packed, clip, num_history=config.num_history, num_frames=num_frames)
+    history, path, real = followed(packed, models[SYSTEMS[0][0]].config)
     made = {"real clip": real}
     for name, steps in SYSTEMS:
         rollout = MotionGenerator(models[name], steps).rollout([path], [STYLE], seed=SEED, history=history)
@@ -112,8 +117,7 @@ def main() -> None:
         weights_digests={name: weights_digest(model.params) for name, model in models.items()},
     )  # fmt: skip
     path = repository_root() / "paper_figures/bandai/laptop/media/side_by_side.webp"
-    for name, motion in zip(("real", "steady"), walkers.values(), strict=False):
-        write_bvh(path.with_name(f"side_by_side_{name}.bvh"), motion, overwrite=True)
+    write_bvh(path.with_name("side_by_side_steady.bvh"), list(walkers.values())[1], overwrite=True)
     durations = [1000 // FPS] * (len(pictures) - 1) + [1000]  # a pause before it starts again
     with whole_file(path, overwrite=True) as temporary:
         pictures[0].save(

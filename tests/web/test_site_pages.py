@@ -1,5 +1,6 @@
 """The built site in a real browser, opened from the disk: `make site`, then `make test-web`."""
 
+import os
 from pathlib import Path
 
 import pytest
@@ -94,7 +95,8 @@ def test_the_first_screen_says_what_this_is_shows_a_walk_and_leads_on(browser, s
     assert (SITE / "docs" / page.script(about, "image")).is_file()
     page.driver.switch_to.frame(page.find("iframe.first"))
     page.wait("return document.documentElement.dataset.ready === 'yes'", 60)
-    assert page.script("return document.querySelectorAll('.panel').length") == 2
+    panels = 2 if os.environ.get("F3AMD_DATA_DIR") else 1  # the real clip is no part of the repository
+    assert page.script("return document.querySelectorAll('.panel').length") == panels
     page.driver.switch_to.default_content()
     page.resize(*PHONE, phone=True)
     page.screenshot(screenshots / "site_first_page_phone.png")
