@@ -1,7 +1,7 @@
 """Draw the README's moving picture: a real clip and three generated walks on its path, abreast on one floor.
 
-The second is written as BVH, too, for the site's first page (`docs/players.py`), which puts the real clip beside it where
-the data are.
+The second is written as BVH, too, for the site's first page (`docs/players.py`), which puts the real clip beside it
+where the data are.
 
     python scripts/side_by_side.py      (needs the data set bandai: downloaded, or in F3AMD_DATA_DIR)
 

@@ -224,3 +224,11 @@ def test_camdms_orientation_error_sees_the_shoulders_as_its_code_does():
     measured = camdm_metrics(positions, path, skeleton)["camdm_orientation_error_deg"]
     assert measured == pytest.approx(np.rad2deg(0.4))
     assert camdm_orientation_error(np.zeros(20), path) == pytest.approx(0.0)
+
+
+def test_a_single_file_is_no_data_set(tmp_path, monkeypatch):
+    file = tmp_path / "walk.bvh"
+    file.write_text(TEXT)
+    monkeypatch.setenv(sources.DATA_DIR_VARIABLE, str(file))
+    for name in ("folder", "bandai"):
+        refused("walk.bvh: is a single file; give its folder", open_dataset, name)

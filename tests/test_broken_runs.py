@@ -12,6 +12,7 @@ import pandas as pd
 import pytest
 from builders import HISTORY, WINDOW, refused, tiny_packed, tiny_task
 
+from f3amd_companion import __main__ as command_line
 from f3amd_lib.ground.files import locked
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import kept_rows, read_table, write_table
@@ -123,3 +124,15 @@ def test_a_lock_is_free_once_its_process_is_killed(tmp_path):
         process.wait()
     with locked(lock, "work"):
         pass
+
+
+@pytest.mark.parametrize(("command", "goes_on"), [("presets", False), ("train", True)])
+def test_ctrl_c_ends_in_one_line(monkeypatch, capsys, command, goes_on):
+    def stopped(*args, **settings):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(command_line.tyro.extras, "subcommand_cli_from_dict", stopped)
+    assert command_line.main([command]) == 130
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1 and lines[0].startswith(f"f3amd {command}: stopped")
+    assert ("goes on" in lines[0]) == goes_on

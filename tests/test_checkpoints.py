@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from builders import refused
 from safetensors.numpy import save_file
 
 from f3amd_lib.data.features import frame_positions
@@ -184,3 +185,10 @@ def test_eight_bits_are_off_by_half_a_step_of_each_column(trained, tmp_path, mon
     twice = load_model(tmp_path / "again.safetensors").params
     for ours, theirs in zip(jax.tree.leaves(again.params), jax.tree.leaves(twice), strict=True):
         np.testing.assert_allclose(np.asarray(theirs), np.asarray(ours), rtol=1e-5)
+
+
+@pytest.mark.parametrize("content", [b"", b"\x80\x04\x95pickle", bytes(1000)])
+def test_foreign_files_are_refused_by_name(tmp_path, content):
+    path = tmp_path / "foreign.safetensors"
+    path.write_bytes(content)
+    refused(r"foreign\.safetensors", load_model, path)

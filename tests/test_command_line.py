@@ -387,3 +387,44 @@ def test_claims_outside_a_clone_say_where_to_run_them(monkeypatch, tmp_path, cap
     monkeypatch.setattr("f3amd_companion.ledger.claims.repository_root", lambda: tmp_path)
     assert main(["claims"]) == 2
     assert "run this in a clone of the repository" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("busy", ["hashlib.pbkdf2_hmac('sha256', b'', b'', 2**31 - 1)", "time.sleep(1000)"])
+def test_ctrl_c_ends_compiled_code_and_python(busy):
+    """The first hears of no signal, as XLA does not while it compiles."""
+    script = f"""
+import hashlib, sys, time
+import f3amd_companion.__main__ as command_line
+def rollout() -> None:
+    print("begun", flush=True)
+    {busy}
+def walk() -> None: "Two commands are the least."
+command_line.COMMANDS, sys.argv = (rollout, walk), ["f3amd", "rollout"]
+sys.exit(command_line.main())
+"""
+    running = subprocess.Popen(
+        [sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    try:
+        assert running.stdout.readline() == "begun\n"
+        running.send_signal(signal.SIGINT)
+        assert running.wait(timeout=60) == 130
+        assert running.stderr.read().split() == "f3amd rollout: stopped by Ctrl-C".split()
+    finally:
+        running.kill()
+
+
+def test_pictures_of_another_crowd_are_not_written_over(weights, tmp_path, capsys):
+    out = tmp_path / "crowd"
+    words = ["crowd", "--weights", weights, "--out", str(out), "--steps", "1", "--characters", "2"]
+    words += ["--seconds", "0.2", "--pictures"]
+    for name in ("crowd.html", "crowd.png"):
+        (tmp_path / name).write_text("of another crowd")
+        assert main(words) == 2
+        assert f"{tmp_path / name}: exists already; pass --overwrite" in capsys.readouterr().err
+        assert (tmp_path / name).read_text() == "of another crowd"
+        assert not out.exists()  # nothing was generated for nothing
+        (tmp_path / name).unlink()
+    (tmp_path / "crowd.html").write_text("of another crowd")
+    assert main([*words, "--overwrite"]) == 0
+    assert "player-data" in (tmp_path / "crowd.html").read_text(encoding="utf-8")

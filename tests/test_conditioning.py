@@ -9,6 +9,7 @@ from flax import nnx
 
 from f3amd_lib.networks import conditioning
 from f3amd_lib.networks.attention import TransformerBlock, position_code
+from f3amd_lib.networks.conditioning import Concatenation
 from f3amd_lib.networks.spectral import FNOBlock
 
 CHANNELS, STYLES, WIDTH, WINDOW, HISTORY = 9, 3, 8, 6, 4
@@ -166,3 +167,11 @@ def test_table_11_cross_attention_is_added_to_the_base_block(num_heads):
     z_tilde = z_base + np.asarray(layer.attention(z_base + code, c))
     expected = silu(linear(layer.output, z_tilde))
     np.testing.assert_allclose(Compiled(layer)(jnp.sin, z, c), expected, atol=1e-5)
+
+
+def test_table_11_concatenation_is_the_base_block_and_the_output_layer():
+    layer = randomise(Concatenation(WIDTH, rngs=nnx.Rngs(params=0)))
+    z, c = draw(2, 2 * WINDOW, WIDTH), draw(2, WINDOW, WIDTH, seed=1)
+    expected = silu(linear(layer.output, np.sin(z)))
+    np.testing.assert_allclose(Compiled(layer)(jnp.sin, z, c), expected, atol=1e-5)
+    np.testing.assert_array_equal(Compiled(layer)(jnp.sin, z, c + 1.0), Compiled(layer)(jnp.sin, z, c))

@@ -148,3 +148,26 @@ def test_use_of_inputs_is_told_on_held_out_windows(model_that, answer, uses_x, u
     assert (value["use_of_sigma"] > 0.5 * max(1.0, value["use_of_x"])) == uses_sigma
     if not uses_x:
         assert value["use_of_x"] < 1e-3
+
+
+@pytest.mark.slow
+def test_a_network_that_ignores_its_input_errs_alike_everywhere(model_that):
+    trained = model_that(lambda x_noisy, sigma: 0.0 * x_noisy)
+    windows = tiny_windows()
+    table = denoising.x0_error_by_sigma(trained, windows, SIGMAS)
+    batch = spread_windows(windows, denoising.WINDOWS)
+    x0, _ = network_inputs(batch, trained.normaliser)
+    np.testing.assert_allclose(table["x0_error"], float(np.sqrt(np.mean(x0**2))), rtol=1e-5)
+    use = denoising.noise_use(MotionGenerator(trained, 1), windows)
+    assert use["x0_error_ratio"] == pytest.approx(1.0)
+    assert use["seed_spread_cm"] == pytest.approx(0.0, abs=1e-4)
+
+
+def test_a_network_that_sees_sigma_alone_moves_with_it_though_it_ignores_its_input():
+    # 0.5 below sigma 1 and 0.3 above: its samples are 0.5 from 2 steps on, and 0.3 at 1.
+    answer = lambda x, sigma: 0.0 * x + jnp.where(sigma < 1.0, 0.5, 0.3)
+    estimates = estimates_on_a_walk(answer)
+    share = np.mean(np.unique(estimates, return_inverse=True)[1])
+    over_noise, over_levels = denoising.estimate_variances(estimates)
+    assert over_noise == pytest.approx(0.0, abs=1e-20)
+    assert over_levels == pytest.approx(0.2**2 * share * (1 - share))

@@ -151,3 +151,12 @@ def test_one_core_gives_the_same_up_to_rounding(here, tmp_path):
     assert adrift <= 2 * STEPS * RATE and max(far.values()) <= BOUND, (adrift, far)
     for paper in PAPERS:  # what is drawn is drawn by bits, whatever the threads
         assert far[f"{paper} windows"] == 0.0, far
+
+
+def test_a_shift_of_the_last_digits_is_noticed(here, tmp_path):
+    for path in here.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    with np.load(here / "f3amd samples.npz") as arrays:
+        np.savez(tmp_path / "f3amd samples.npz", *(arrays[name] * np.float32(1 + 4 * BOUND) for name in arrays))
+    assert hashes(tmp_path) != hashes(here)
+    assert apart(here, tmp_path)["f3amd samples"] > BOUND >= apart(here, tmp_path)["acmdm samples"]

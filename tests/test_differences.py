@@ -61,3 +61,18 @@ def test_there_are_rows_on_all_three_papers():
 @pytest.mark.parametrize("row", ROWS, ids=[row[0][:40] for row in ROWS])
 def test_a_row_says_where_it_is_shown_and_that_is_there(row):
     assert re.search(r"`|\]\(", row[3]) and missing(row[3]) == []
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        "[2.9](/notebooks/02_sampler_theory.ipynb)",
+        "`diffusion/samplers.ddim_stride`",
+        "`tests/test_samplers.test_nothing`",
+        "`papers/acmdm/numbers/acmdm_table44.csv`",
+        "`acmdm/readings: direction of space`",
+    ],
+)
+def test_a_reference_that_leads_nowhere_is_found(wrong):
+    right = "[2.3](/notebooks/02_sampler_theory.ipynb), `diffusion/schedules.NoiseSchedule.times`"
+    assert missing(f"{right}, {wrong}") == [wrong.strip("`")]

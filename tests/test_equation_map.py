@@ -7,6 +7,7 @@ import json
 import pandas as pd
 import pytest
 from f3amd_notebooks import equation_map as map_module
+from f3amd_notebooks.equation_map import mentioned_equations
 from f3amd_notebooks.readings import fill_reading, readings_table
 from f3amd_notebooks.stored_result import running_times
 
@@ -191,3 +192,14 @@ def test_a_broken_open_point_is_refused(changes, message):
     assert fill_reading(READING | {"field": "F3AMDConfig.dropout"}, "f.toml", CONFIGS) == str(
         F3AMDConfig(channels=1, num_styles=1).dropout
     )
+
+
+@pytest.mark.parametrize(
+    ("text", "unknown"),
+    [
+        ("Eq. 9, MotionPCM Eqs 15 to 19 and ACMDM Eq. 2", []),
+        ("the step of Eq. 15; ACMDM Eqs 2 and 3; as in CAMDM Eq. 30", ["acmdm Eq. 3", "f3amd Eq. 15", "f3amd Eq. 30"]),
+    ],
+)
+def test_equations_that_no_paper_has_are_found(text, unknown):
+    assert unknown_equations(mentioned_equations(text)) == unknown

@@ -308,3 +308,15 @@ def test_lengths_are_metres_beside_a_leg(walk):
     lengths = foot_locking.FARTHEST, foot_locking.DEEPEST, feet_oracle.SLACK, foot_locking._STEP_HEIGHT
     for metres, share in zip(lengths, (0.4, 0.08, 0.05, 0.05), strict=True):
         assert 0.1 * share < metres / length < share
+
+
+def test_only_legs_turn_bones_and_root_stay_and_feet_keep_their_orientation(drifted):
+    raw, locked = drifted
+    legs = leg_chains(SYNTHETIC_SKELETON)[:, :3].ravel()
+    others = [joint for joint in range(SYNTHETIC_SKELETON.num_joints) if joint not in legs]
+    before, after = motion_of(raw), motion_of(locked)
+    np.testing.assert_allclose(after.rotations[:, others], before.rotations[:, others], atol=1e-9)
+    np.testing.assert_array_equal(locked[:, :3], raw[:, :3])
+    turned = [global_rotations(SYNTHETIC_SKELETON, motion.rotations)[:, legs[2::3]] for motion in (before, after)]
+    np.testing.assert_allclose(*turned, atol=1e-6)
+    assert np.abs(after.rotations[:, legs] - before.rotations[:, legs]).max() > 0.05

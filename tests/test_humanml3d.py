@@ -269,3 +269,34 @@ def test_nothing_is_written_over(bvh_folder, tmp_path):
     (tmp_path / "mine.txt").write_text("mine")
     with pytest.raises(ValueError, match="is not empty; choose another folder"):
         captioned_folder.write_humanml3d(tmp_path, data)
+
+
+@pytest.mark.slow
+def test_a_folder_with_ten_broken_records_of_sixty_trains(tmp_path, caplog):
+    folder = write_tree(tmp_path / "set")
+    names = {split: [f"{split}{k}" for k in range(count)] for split, count in (("train", 50), ("val", 7), ("test", 3))}
+    for split, every in names.items():
+        (folder / f"{split}.txt").write_text("\n".join(every))
+        for name in every:
+            for part, known in (
+                ("new_joints", "000001.npy"),
+                ("new_joint_vecs", "000001.npy"),
+                ("texts", "000001.txt"),
+            ):
+                shutil.copy(folder / part / known, folder / part / known.replace("000001", name))
+    for k in range(5):
+        (folder / "texts" / f"train{k}.txt").write_text("#x#0.0#0.0\n")
+        put(f"train{k + 5}", np.full((60, 22, 3), np.inf))(folder)
+    words = "train --data folder --profile smoke --preset ACMDM-S-PS22-raw-n2 --steps 2 --batch-size 4 --window 40"
+    assert main([*words.split(), "--source", str(folder), "--out", str(tmp_path / "models")]) == 0
+    assert "10 of 60 records are broken and left out: train0: " in caplog.text
+    assert list((tmp_path / "models").glob("*.safetensors"))
+
+
+def test_caption_lines_are_read_as_they_were_written():
+    line = captioned_folder.write_caption_line("A man's self-assured walk, twice.")
+    assert (
+        line
+        == "A man's self-assured walk, twice.#a/OTHER man's/OTHER self-assured/OTHER walk/OTHER twice/OTHER#0.0#0.0"
+    )
+    assert humanml3d.read_caption_line(line, "here") == ("A man's self-assured walk, twice.", 0.0, 0.0)

@@ -77,3 +77,14 @@ def test_figures_by_hand():
     halves = table[table["metric"] == "from_half_the_steps"]
     assert list(zip(halves["update"], halves["steps"], strict=True)) == [("rescaled", 2)]
     assert set(table.loc[table["metric"] == "joint_acceleration", "unit"]) == {"cm/frame^2"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("spacing", ["endpoints", "uniform"])
+def test_a_network_that_ignores_its_input_hides_the_missing_factor(model_that, spacing):
+    trained = model_that(lambda x_noisy, sigma: 0.0 * x_noisy + 0.2)
+    table = window_figures(walked(trained, spacing=spacing)[0])
+    for steps in (4, 2):
+        for metric in ("from_rescaled", "seed_spread"):
+            assert one(table, "literal", steps, metric) == pytest.approx(0.0, abs=1e-4)
+    assert one(table, "literal", 4, "from_half_the_steps") == pytest.approx(0.0, abs=1e-4)

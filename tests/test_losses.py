@@ -148,3 +148,17 @@ def test_weights_count_samples_and_equal_ones_change_nothing():
         np.testing.assert_allclose(value, once[name], rtol=1e-5)
         np.testing.assert_allclose(mixed[name], 0.75 * first[name] + 0.25 * second[name], rtol=1e-5)
         assert value == 0.0 or abs(mixed[name] / value - 1.0) > 1e-4, name
+
+
+def test_eq12_position_of_a_bent_hip_by_hand():
+    # The left leg (joint 2) swings a quarter about +X: the toe goes from (0, -0.8, 0.1) to
+    # (0, -0.1, -0.8) below the hip, off by (0, 0.7, -0.9); no other joint moves.
+    bent = standing().at[..., 3 + 12 : 3 + 18].set(jnp.array([1.0, 0, 0, 0, 0, 1.0]))
+    terms = terms_of(bent, standing())
+    assert terms["position"] == pytest.approx((0.49 + 0.81) / (SKELETON.num_joints * 3), rel=1e-4)
+
+
+def test_appendix_b_foot_looks_at_toes_only():
+    # Swinging the spine and its tip moves no toe.
+    swung = standing().at[:, 2:, 3 + 6 : 3 + 12].set(jnp.array([1.0, 0, 0, 0, 0, 1.0]))
+    assert terms_of(swung, standing())["foot"] == pytest.approx(0.0, abs=1e-12)

@@ -268,3 +268,8 @@ def test_paths_that_do_not_fit_are_refused():
     refused("finite", metrics.direction_error, np.full(64, np.nan), np.zeros(64), WINDOW)
     refused("window must be", metrics.ird_excess, glide(), 1)
     refused(r"\[128, 1\] .* got \(100, 1\)", metrics.camdm_orientation_error, np.zeros(128), np.zeros(100))
+
+
+def test_planted_foot_does_not_slide():
+    value, share = metrics.foot_sliding(slider(slide=0.0), SKELETON)
+    assert value == 0.0 and share == pytest.approx(0.5)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from f3amd_lib.diffusion.oracles import GaussianMixture
-from f3amd_lib.diffusion.samplers import ddim_step
+from f3amd_lib.diffusion.samplers import add_noise, ddim_step
 from f3amd_lib.diffusion.schedules import variance_exploding
 
 TWO = GaussianMixture([-1.0, 1.0], width=0.3, weights=[1.0, 3.0])
@@ -56,3 +56,17 @@ def test_flow_is_where_fine_steps_lead_and_can_be_undone():
     exact = TWO.flow(x, 64.0, 0.01)
     np.testing.assert_allclose(state, exact, atol=5e-3)
     np.testing.assert_allclose(TWO.flow(exact, 0.01, 64.0), x, rtol=1e-9)
+
+
+def test_eq08_noisy_samples_follow_the_noisy_density():
+    rng = np.random.default_rng(3)
+    clean = TWO.sample(rng, 40_000)
+    noisy = add_noise(clean, 0.7, rng.standard_normal(clean.shape))
+    edges = np.linspace(-3, 3, 13)
+    count, _ = np.histogram(noisy, edges)
+    inner = 0.5 * (edges[1:] + edges[:-1])
+    # Simpson's rule over each bin
+    density = sum(
+        w * np.exp(TWO.log_density(x[:, None], 0.7)) for w, x in ((1, edges[:-1]), (4, inner), (1, edges[1:]))
+    )
+    np.testing.assert_allclose(count / len(noisy), density * 0.5 / 6, atol=0.008)

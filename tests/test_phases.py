@@ -260,3 +260,22 @@ def end_at(mixture: GaussianMixture, edge):
         return jnp.asarray((flowed(mixture, x, sigma, edge) - kept * np.asarray(x)) / (1.0 - kept))
 
     return answer
+
+
+def gaussian_noise(state, time, mean=0.3, variance=0.6):
+    """The exact noise estimate of one Gaussian, numpy."""
+    alpha, sigma = shares(SCHEDULE, time, np)
+    return sigma * (state - alpha * mean) / (alpha**2 * variance + sigma**2)
+
+
+@pytest.mark.parametrize("skip, wanted", [(100, 1.4150), (20, 1.5600)])
+def test_jumps_through_a_gaussian_end_where_the_sheet_says(skip, wanted):
+    phases, state = cut_phases(1000, skip), np.asarray(1.7)
+    for time, before in zip(phases.times[::-1], phases.before[::-1], strict=True):
+        state = jump(SCHEDULE, state, gaussian_noise(state, time), time, before)
+    assert state == pytest.approx(wanted, abs=6e-5)
+    # The exact flow keeps the quantile: 1.6024.
+    spread = lambda t: np.sqrt(SCHEDULE.alpha_bars[t] * 0.6 + 1 - SCHEDULE.alpha_bars[t])
+    alpha = np.sqrt(SCHEDULE.alpha_bars)
+    exact = alpha[0] * 0.3 + (1.7 - alpha[999] * 0.3) * spread(0) / spread(999)
+    assert exact == pytest.approx(1.6024, abs=5e-5) and abs(state - exact) > 1e-3

@@ -19,6 +19,7 @@ from f3amd_lib.ground.records import read_table
 from f3amd_lib.measures import protocol as module
 from f3amd_lib.measures.classifier import train_classifier
 from f3amd_lib.measures.distributions import diversity
+from f3amd_lib.measures.protocol import REFERENCE_MODELS, measure_real
 from f3amd_lib.measures.real_clips import sideways_share
 from f3amd_lib.measures.registry import METRICS, SHOWN
 from f3amd_lib.motion.root_paths import named_path
@@ -297,3 +298,16 @@ def test_the_measurement_keeps_its_rows_and_goes_on(name, prepared, monkeypatch)
     monkeypatch.setattr(measure, "measure_model", None)
     measure.measure_quality(prepared, profile)
     pd.testing.assert_frame_equal(read_table(path)[0], table)
+
+
+@pytest.mark.slow
+def test_bad_generators_are_told_apart(packed, classifier):
+    tables = {model: measure_real(packed, classifier, SMALL, window=32, model=model) for model in REFERENCE_MODELS}
+    real = tables["real"]
+    assert one(tables["frozen pose"], "bone_swing") < 0.1 * one(real, "bone_swing")
+    assert one(tables["frozen pose"], "foot_alternation") < 0.5 * one(real, "foot_alternation")
+    for broken in ("shuffled frames", "noisy motion"):
+        assert one(tables[broken], "IRD") > 1.5 * one(real, "IRD")
+    for broken in REFERENCE_MODELS[2:]:  # of frozen poses so few windows say little
+        assert one(tables[broken], "FID") > one(real, "FID")
+    refused("unknown reference 'frozen'", measure_real, packed, classifier, SMALL, window=32, model="frozen")

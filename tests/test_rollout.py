@@ -219,3 +219,17 @@ def test_styles_without_a_starting_pose_need_a_history():
     refused("'proud': pass `history`", generator.rollout, path, "proud")
     history = np.tile(np.concatenate([[0.0, 0.9, 0.0], POSE]), (1, HISTORY, 1))
     assert generator.rollout(path, "proud", history=history).frames.shape == (1, 10, CHANNELS)
+
+
+def test_each_round_starts_from_the_frames_made_before(trained):
+    rollout = obedient(trained).rollout(named_path("straight", 4 * WINDOW), "calm")
+    height = rollout.history[0, -1, 1] + np.arange(1, 4 * WINDOW + 1)
+    np.testing.assert_allclose(rollout.frames[0, :, 1], height, rtol=1e-5)
+
+
+def test_the_path_of_one_character_is_nothing_to_another(network_generator):
+    straight, circle = named_path("straight", 20), named_path("circle", 20)
+    first = network_generator.rollout([straight, straight], ["calm", "proud"]).frames
+    second = network_generator.rollout([straight, circle], ["calm", "proud"]).frames
+    np.testing.assert_allclose(first[0], second[0], atol=1e-5)
+    assert np.abs(first[1] - second[1]).max() > 1e-3

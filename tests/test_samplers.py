@@ -16,6 +16,7 @@ from f3amd_lib.diffusion.samplers import (
     ddpm_posterior,
     ddpm_step,
     num_evaluations,
+    probability_flow_slope,
     sample,
     walk,
 )
@@ -319,3 +320,15 @@ def test_the_walk_in_python_visits_what_the_scan_goes_through(name, num_steps):
     np.testing.assert_allclose(
         visited[-1].x_noisy, sample(name, two_modes(), x_init, sigmas, key=key), rtol=2e-5, atol=2e-5
     )
+
+
+def test_probability_flow_follows_the_score():
+    # dx/dsigma = -sigma * grad log p(x; sigma) (Karras et al. 2022, Eq. 3 with sigma(t) = t).
+    mixture = GaussianMixture([-1.0, 1.0], 0.3)
+    x, sigma = np.linspace(-4.0, 4.0, 17)[:, None], 0.6
+    slope = probability_flow_slope(x, mixture.denoise(x, sigma), sigma)
+    np.testing.assert_allclose(slope, -sigma * mixture.score(x, sigma), atol=1e-13)
+    # And it is the slope of the path itself.
+    step = 1e-4
+    path = mixture.flow(x, sigma, sigma + step) - mixture.flow(x, sigma, sigma - step)
+    np.testing.assert_allclose(slope, path / (2 * step), atol=1e-6)

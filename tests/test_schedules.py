@@ -9,6 +9,7 @@ import pytest
 from builders import refused
 
 from f3amd_lib.diffusion import schedules
+from f3amd_lib.diffusion.schedules import variance_exploding
 
 # Cube roots 2 and 1: every level of this schedule can be worked out by hand.
 HAND = schedules.variance_exploding(sigma_max=8.0, sigma_min=1.0, rho=3.0)
@@ -220,3 +221,10 @@ def test_each_of_a_few_levels_is_drawn_as_often_as_the_next():
     drawn = np.asarray(schedule.draw(jax.random.key(0), (4000,)))
     shares = [np.isclose(drawn, level, rtol=1e-5).mean() for level in schedule.levels]
     assert shares == pytest.approx([0.25] * 4, abs=0.03)
+
+
+def test_eq09_hand_values_of_a_three_step_grid():
+    # t = 0, 1/2, 1: 2^3, 1.5^3, 1^3, then clean.
+    np.testing.assert_allclose(HAND.grid(3), [8.0, 3.375, 1.0, 0.0], rtol=1e-14)
+    # 128^(1/3) = 5.0396842, 0.01^(1/3) = 0.2154435; their mean cubed.
+    np.testing.assert_allclose(variance_exploding().grid(3), [128.0, 2.62756385**3, 0.01, 0.0], rtol=1e-7)

@@ -271,3 +271,28 @@ def test_actions_are_pinned_to_commits():
     assert len(lines) == 6
     for line in lines:
         assert re.fullmatch(r"actions/[\w-]+@[0-9a-f]{40} # v\d+(\.\d+)*", line), line
+
+
+@pytest.mark.needs("sphinx")
+def test_an_altered_mathjax_is_refused(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(DOCS / "_ext"))
+    companion = load(DOCS / "_ext" / "companion.py")
+
+    class App:
+        outdir = tmp_path / "html"
+
+    companion.copy_mathjax(App)
+    copied = tmp_path / "html" / "_static" / "mathjax"
+    assert "Apache License" in (copied / "LICENSE").read_text(encoding="utf-8")
+    assert (copied / "tex-svg-full.js").stat().st_size > 2_000_000
+    monkeypatch.setattr(companion, "MATHJAX_SHA256", "0" * 64)
+    with pytest.raises(companion.ExtensionError, match="not MathJax 3.2.2 as published"):
+        companion.copy_mathjax(App)
+
+
+def test_pictures_of_non_commercial_data_say_so():
+    text = pages.moving_markdown("bandai")
+    assert "© 2022 Bandai Namco Research Inc." in text
+    assert "for non-commercial use" in text
+    first_page = (DOCS / "index.md").read_text(encoding="utf-8")
+    assert "CC BY-NC 4.0" in first_page and "non-commercial use" in " ".join(first_page.split())

@@ -450,3 +450,15 @@ def test_real_bandai_archive(bandai_dataset):
         assert abs(count["test"] - count.total() / 10) <= 0.5, style
     motion = bandai_dataset.clips[0].load()
     assert motion.skeleton.num_joints == 21 and motion.skeleton.names[0] == "Hips"
+
+
+def test_bandai_refuses_flipped_bits_inside_a_zip(small_bandai, tmp_path):
+    zipped = zip_folder(small_bandai, tmp_path / "bandai_namco.zip")
+    with zipfile.ZipFile(zipped) as archive:
+        (info,) = [item for item in archive.infolist() if "angry_002" in item.filename]
+    data = bytearray(zipped.read_bytes())
+    data[info.header_offset + 200] ^= 0xFF  # inside the compressed text
+    zipped.write_bytes(bytes(data))
+    dataset = open_dataset("bandai", path=zipped)
+    (clip,) = [clip for clip in dataset.clips if "angry_002" in clip.name]
+    refused(r"bandai_namco\.zip: .*angry_002\.bvh: damaged", clip.load)

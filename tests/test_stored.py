@@ -108,3 +108,13 @@ def test_committed_records_are_of_the_weights_that_ship_or_are_marked(path, ship
     for model, digests in (record.get("weights_digests") or {}).items():
         if (record["dataset"], model) in shipped_digests:
             assert digests == [shipped_digests[record["dataset"], model]], model
+
+
+def test_every_record_that_names_models_that_ship_is_held_to_their_weights(shipped_digests):
+    named = {
+        path.stem
+        for path in RECORDS
+        for model in records.read_table(path)[1].get("weights_digests") or {}
+        if (path.parts[-4], model) in shipped_digests
+    }
+    assert {"quality", "trained", "feet", "input_use"} <= named and named <= records.ON_WEIGHTS

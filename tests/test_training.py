@@ -259,3 +259,11 @@ def test_a_gradient_is_clipped_before_adam_sees_it():
 
     assert second(1.0, 1000.0) == pytest.approx(second(1.0, 1.0))
     assert abs(second(0.0, 1000.0) / second(0.0, 1.0) - 1.0) > 0.1
+
+
+def test_eq09_training_noise_is_uniform_in_schedule_time():
+    config = TrainingConfig(10)
+    sigma = np.asarray(denoising_task.draw_sigma(jax.random.key(0), 4000, config))
+    time = schedule_time(sigma)
+    counts = np.histogram(time, bins=8, range=(0, 1))[0]
+    assert counts.sum() == 4000 and np.all(np.abs(counts - 500) < 100)

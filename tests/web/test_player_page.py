@@ -608,3 +608,26 @@ def test_names_ghost_and_persons(browser, walks, tmp_path, screenshots):
         [*walks[1].root_position[0, [0]], 0.88, *walks[1].root_position[0, [2]]], abs=0.15
     )
     browser.script("player.followPerson(player.characters[0])")
+
+
+def test_the_page_forbids_itself_any_request(browser, alone):
+    opened(browser, alone)
+    assert browser.fetched("http://outside.invalid/") == "TypeError"
+    assert any("Content Security Policy" in message for message in browser.errors())
+    assert browser.outside() == []
+
+
+def test_titles_stand_over_their_panels_and_text_is_text(browser, side_by_side):
+    opened(browser, side_by_side)
+    captions = browser.script(
+        "return [...document.querySelectorAll('.panel')].map((one) =>"
+        " [one.querySelector('strong').textContent, one.getBoundingClientRect().left,"
+        "  one.querySelector('.labels').getAttribute('aria-label')])"
+    )
+    assert [title for title, _, _ in captions] == TITLES
+    lefts = [left for _, left, _ in captions]
+    assert lefts == sorted(lefts) and len(set(lefts)) == 4  # side by side on a desktop
+    assert all(label == f"{title}: 1 character of 23 joints, 3.0 seconds" for title, _, label in captions)
+    assert browser.find("h1").text == "One path & four ways"
+    assert browser.find("figcaption span").text == "a note <b>below</b>"
+    assert browser.find(".credit").text == "Nobody's"
