@@ -14,12 +14,10 @@ VENV := $(or $(F3AMD_VENV),.venv)
 PYTHON := $(VENV)/bin/python
 INSTALLED := $(VENV)/installed
 NOTEBOOKS := $(sort $(wildcard notebooks/*.ipynb notebooks/course/*.ipynb notebooks/standalone/*.ipynb))
-# For `make test-slow` and `make test-long`: they take 20 to 90 CPU seconds each, where 10 are usual, since they train, search,
-# time or compile whole networks, all by code that has tests of its own; the long ones are the longest, and solutions that tests
-# run cell by cell. The rest is to stay below 220 in all.
-NAMED = $(sort $(foreach name,$(1),$(wildcard notebooks/$(name)_*.ipynb)))
-SLOW_NOTEBOOKS := $(call NAMED,04 06 07 16 course/06)
-LONG_NOTEBOOKS := $(call NAMED,10 11 12 13 14 17 20 21 22 $(addprefix course/,09 10 11 12 13 14))
+# For `make test-slow`: they take 20 to 90 CPU seconds each, where 10 are usual, since they train, search, time or compile whole
+# networks, all by code that has tests of its own. The rest is to stay below 220 in all.
+SLOW_NOTEBOOKS := $(sort $(foreach name,04 06 07 10 11 12 13 14 16 17 20 21 22 $(addprefix course/,06 09 10 11 12 13 14),\
+  $(wildcard notebooks/$(name)_*.ipynb)))
 
 export F3AMD_PYTHON
 
@@ -83,16 +81,15 @@ sweep-tools: $(VENV)/extra-sweep ## Add Dask distributed to .venv, for f3amd swe
 
 test: lint ## Lint, run the tests but the slow ones, check committed outputs of most notebooks
 	$(PYTEST) $(NO_NOTEBOOKS) tests $(SIDE_BY_SIDE) -m "not slow and not long" $(PYTEST_OPTIONS)
-	$(call COMPARED,$(filter-out $(SLOW_NOTEBOOKS) $(LONG_NOTEBOOKS),$(NOTEBOOKS)))
+	$(call COMPARED,$(filter-out $(SLOW_NOTEBOOKS),$(NOTEBOOKS)))
 
 # Every preset, whole trainings, several processes: what would make `make test` long.
 test-slow: $(INSTALLED) ## Run the slow tests and notebooks that `make test` leaves out
 	$(PYTEST) $(NO_NOTEBOOKS) $(SIDE_BY_SIDE) $(call MARKED,slow, and not long) $(PYTEST_OPTIONS)
 	$(call COMPARED,$(SLOW_NOTEBOOKS))
 
-test-long: $(INSTALLED) ## Rehearse all commands of the ledger at smoke size, the longest notebooks, and all with other seeds
+test-long: $(INSTALLED) ## Rehearse all commands of the ledger at smoke size, and the notebooks with other seeds
 	$(PYTEST) $(NO_NOTEBOOKS) $(SIDE_BY_SIDE) $(call MARKED,long) $(PYTEST_OPTIONS)
-	$(call COMPARED,$(LONG_NOTEBOOKS))
 
 test-all: test test-slow test-long test-extras site test-web ## All tests there are, with the site and the browser
 
