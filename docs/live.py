@@ -97,7 +97,7 @@ def make_live(page: Path, made: dict[str, str]) -> None:
 def main(site: Path) -> None:
     names = notebook_names(*CELLS)
     program = denoiser_program(names["model"].network(), weights="int8")
-    steer.write_steer(site / "steer.html", names["model"], program=program)
+    steer.write_steer(site / "steer.html", names["model"], program=program, home="docs/index.html")
     make_live(site / "notebooks" / f"{NOTEBOOK}.html", scripts(*figures_data(names), program))
 
 

@@ -1,4 +1,4 @@
-"""Write the pages of the site that move: the walk of its first page, the steer page, walkers and crowds.
+"""Write the pages of the site that move: the walk of its first page, walkers and crowds.
 
     python docs/players.py docs/_build/html
 
@@ -22,9 +22,8 @@ import side_by_side  # noqa: E402
 
 from f3amd_companion.__main__ import main as command  # noqa: E402
 from f3amd_companion.serving.player import Scene, write_player  # noqa: E402
-from f3amd_companion.serving.steer import write_steer  # noqa: E402
 from f3amd_lib.data.sources import DATA_DIR_VARIABLE  # noqa: E402
-from f3amd_lib.ground.profiles import find_model, load_profile  # noqa: E402
+from f3amd_lib.ground.profiles import load_profile  # noqa: E402
 from f3amd_lib.motion.bvh import read_bvh  # noqa: E402
 from f3amd_lib.motion.skeleton import resample  # noqa: E402
 from f3amd_lib.training.checkpoints import load_model  # noqa: E402
@@ -76,5 +75,4 @@ def main(site: Path) -> None:
 if __name__ == "__main__":
     site = Path(sys.argv[1])
     write_first(site)
-    write_steer(site / "steer.html", load_model(find_model("synthetic")), home="docs/index.html")
     main(site)
