@@ -97,7 +97,8 @@ def test_a_planned_crowd_keeps_apart_and_is_drawn_beside_its_folder(weights, tmp
     assert main([*words, "--characters", "5", "--plan", "1.5", "--pictures"]) == 0
     crowd = read_crowd(out)
     assert crowd.settings["min_distance"] == 1.5
-    assert closest_approach(crowd.path[..., :2]).min() >= 1.5
+    paths = np.stack([crowd.target(k).position for k in range(len(crowd))])
+    assert closest_approach(paths).min() >= 1.5
     data = shown(tmp_path / "crowd.html")
     assert len(data["scenes"][0]["characters"]) == 5 and data["frames"] == 48
     assert main([*words, "--characters", "5", "--plan", "1.5", "--pictures", "--overwrite", "--raw"]) == 0

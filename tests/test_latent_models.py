@@ -267,8 +267,8 @@ def test_a_student_is_trained_by_name_with_all_before_it(data, tmp_path, monkeyp
     assert all((a == b).all() for a, b in zip(*map(jax.tree.leaves, (alone.params, made.params)), strict=True))
     assert sorted(path.name.split(".")[0] for path in elsewhere.glob("*.safetensors")) == ["tiny-M2"] * 2
     for name, file, reason in (
-        ("tiny-VAE", "tiny-teacher", "tiny-VAE stands on nothing"),
-        ("tiny-M2", "tiny-VAE", "holds tiny-VAE, and tiny-M2 stands on tiny-teacher"),
+        ("tiny-VAE", "tiny-teacher", "tiny-VAE needs no earlier model"),
+        ("tiny-M2", "tiny-VAE", "holds tiny-VAE, and tiny-M2 needs tiny-teacher"),
     ):
         with pytest.raises(ValueError, match=reason):
             from_file(name, teacher=files[file])
@@ -313,7 +313,7 @@ def test_a_student_is_trained_by_name_with_all_before_it(data, tmp_path, monkeyp
     assert not np.array_equal(draw(teacher, num_steps=1), draw(teacher, num_steps=3))
     with pytest.raises(ValueError, match="tiny-M2 takes 2 steps, got 1"):
         draw(made, num_steps=1)
-    with pytest.raises(ValueError, match="only an autoencoder"):
+    with pytest.raises(ValueError, match="is an autoencoder alone"):
         draw(text_models.load_text_model(files["tiny-VAE"]))
     with pytest.raises(ValueError, match="makes up to 40 frames, got 44"):
         latent_motions(made, text, 44, key)

@@ -17,7 +17,7 @@ import f3amd_lib
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = (ROOT / "f3amd_lib", ROOT / "f3amd_companion")
 NOTEBOOKS = ROOT / "notebooks" / "f3amd_notebooks"
-"""Modules alone, beside the notebooks that import them."""
+"""Modules and their tables, beside the notebooks that import them."""
 NAME = f"f3amd_lib-{f3amd_lib.__version__}"
 AROUND = ("pyproject.toml", "MANIFEST.in", "README.md", "LICENSE", "NOTICE")
 """Files that building reads beside the library."""
@@ -41,7 +41,7 @@ def left_out(folder: Path) -> set[str]:
 
 def test_every_file_of_the_packages_is_a_module_or_package_data(tmp_path):
     assert [left_out(package) for package in PACKAGES] == [set(), set()]
-    assert not [name for name in left_out(NOTEBOOKS) if name.endswith(".py")]
+    assert not [name for name in left_out(NOTEBOOKS) if name.endswith((".py", ".csv", ".template"))]
     tmp_path = tmp_path / "f3amd_lib"
     for name in ("__init__.py", "room/module.py", "room/values.toml", "room/notes.txt", "pretrained/set/model.md"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
@@ -76,8 +76,7 @@ def built(tmp_path_factory):
 def test_a_wheel_holds_the_library_its_weights_and_their_terms_and_nothing_else(built):
     wheel, _, metadata = built
     own = {name for name in wheel if not name.startswith(f"{NAME}.dist-info/")}
-    modules = {name for name in files_of(NOTEBOOKS) if name.endswith(".py")}
-    assert own == set().union(*map(files_of, PACKAGES), modules)
+    assert own == set().union(*map(files_of, PACKAGES), files_of(NOTEBOOKS) - left_out(NOTEBOOKS))
     assert {"f3amd_lib/pretrained/bandai/CAMDM.safetensors", "f3amd_lib/pretrained/bandai/CAMDM.md"} <= own
     told = {name.removeprefix(f"{NAME}.dist-info/") for name in wheel - own}
     wanted = {"METADATA", "RECORD", "WHEEL", "entry_points.txt", "top_level.txt", "licenses/LICENSE", "licenses/NOTICE"}
@@ -89,5 +88,5 @@ def test_a_wheel_holds_the_library_its_weights_and_their_terms_and_nothing_else(
 def test_a_source_archive_builds_the_same_and_has_no_tests_data_or_figures(built):
     _, source, _ = built
     own = {name for name in source if not name.startswith("f3amd_lib.egg-info/")}
-    modules = {f"notebooks/{name}" for name in files_of(NOTEBOOKS) if name.endswith(".py")}
+    modules = {f"notebooks/{name}" for name in files_of(NOTEBOOKS) - left_out(NOTEBOOKS)}
     assert own == set().union(*map(files_of, PACKAGES), modules) | set(AROUND) | BESIDE | {"PKG-INFO", "setup.cfg"}

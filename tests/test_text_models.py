@@ -380,7 +380,7 @@ CONTROL = ("a person walks", "--seconds", "1.2", "--control", "CSV")
         (("a person walks", "--then", "a person walks", "--control", "x.csv"), "tiny", None, "leave out --then"),
         (CONTROL, "tiny+control", "frame,x,y,z\n", "needs at least one row"),
         (CONTROL, "tiny+control", "frame,x,y,z\n0,0,1,0\n24,0,1,0\n", "line 3: frame 24 is not one of the clip's"),
-        (CONTROL, "tiny+control", "frame,x,y,z\n3,0,1,0\n3,0,1,0\n", "line 3: frame 3 comes twice"),
+        (CONTROL, "tiny+control", "frame,x,y,z\n3,0,1,0\n3,0,1,0\n", "line 3: frame 3 occurs twice"),
         ((*CONTROL, "--joint", "left_wirst"), "tiny+control", "frame,x,y,z\n3,0,1,0\n", "did you mean 'left_wrist'?"),
     ],
 )
