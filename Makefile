@@ -121,6 +121,7 @@ site: site-tools onnx-tools ## Build notebooks, claims, gallery and API as a sit
 	JAX_PLATFORMS=cpu $(PYTHON) docs/players.py docs/_build/html
 	JAX_PLATFORMS=cpu $(PYTHON) docs/live.py docs/_build/html
 	$(PYTHON) docs/lite.py docs/_build/html
+	JAX_PLATFORMS=cpu $(PYTHON) docs/kit.py docs/_build/html
 	$(PYTHON) docs/check_links.py docs/_build/html
 
 lint: $(INSTALLED) ## Check .py and .ipynb files with ruff, and that each import is declared

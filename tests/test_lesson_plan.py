@@ -9,7 +9,8 @@ from f3amd_notebooks.exercises import CHECKS, hint
 from f3amd_notebooks.labs import LABS
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
-PLAN, SEMESTER = (DOCS / "teaching.md").read_text(encoding="utf-8").split("## Twelve weeks")
+PLAN = (DOCS / "teaching.md").read_text(encoding="utf-8").split("## A semester")[0]
+SEMESTER = (DOCS / "lectures.md").read_text(encoding="utf-8")
 IN_SESSIONS = [number for number in CHECKS if not number.startswith("C")]
 """Exercises of the three sessions; those of the course have numbers that begin with C."""
 
