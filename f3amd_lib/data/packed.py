@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
-import pooch
+import platformdirs
 
 from f3amd_lib.data.features import lowest_toe_height
 from f3amd_lib.data.sources import FPS, MINIMUM_FRAMES, SPLITS, DataCard, Dataset, read_clips
@@ -145,7 +145,7 @@ def _tuples(value):
 
 def cache_folder() -> Path:
     """Return the folder of what was reckoned once (F3AMD_CACHE_DIR overrides)."""
-    return Path(os.environ.get(CACHE_DIR_VARIABLE) or Path(pooch.os_cache("f3amd")) / "packed")
+    return Path(os.environ.get(CACHE_DIR_VARIABLE) or platformdirs.user_cache_path("f3amd") / "packed")
 
 
 def cache_path(dataset: Dataset) -> Path:

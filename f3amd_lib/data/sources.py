@@ -31,7 +31,6 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
-import pooch
 from tqdm import tqdm
 
 from f3amd_lib.ground import log
@@ -333,6 +332,8 @@ def _by_stem(files: Mapping[str, _File]) -> dict[str, _File]:
 
 def _download(name: str) -> str:
     """Fetch a data set's archive once into pooch's cache, with a progress bar; return where it lies."""
+    import pooch  # asks notebooks for a widget when it is imported
+
     published, folder = _SETS[name], pooch.os_cache("f3amd")
     if "url" not in published:
         how = f"name its folder or zip by --source (path=...), or set {DATA_DIR_VARIABLE}"
