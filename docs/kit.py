@@ -136,7 +136,10 @@ def deck(lecture: dict, notebooks: dict):
     """Return a lecture's slides as a notebook: goals, sections, the board, questions with answers below."""
     ask, _, answers = lecture["rest"].partition("<details>")
     answers, _, after = re.sub(r"<summary>.*?</summary>", "", answers).partition("</details>")
-    cells = [slide(new_markdown_cell(f"# {lecture['title']}\n\n{lecture['goals']}\n\n<small>{TERMS}</small>"), "slide")]
+    first = (
+        f"# {lecture['title']}\n\n{lecture['goals']}\n\n[The sheet](../docs/lectures.html)\n\n<small>{TERMS}</small>"
+    )
+    cells = [slide(new_markdown_cell(first), "slide")]
     for name, head in lecture["sections"]:
         cells += slides_of(section(notebooks[name], head))
     for text, kind in ((ask, "slide"), (f"**Answers.** {answers.strip()}", "subslide"), (after.strip(), "slide")):
@@ -255,11 +258,24 @@ def write_archive(path: Path, files: dict) -> None:
             archive.writestr(name, content if isinstance(content, str) else nbformat.writes(content))
 
 
+def link_kit(page: Path) -> None:
+    """Put links to the kit into the page of the sheets; ValueError where it has not a heading for each lecture."""
+    head, *parts = page.read_text(encoding="utf-8").split("</h2>")
+    if len(parts) != len(lectures()):
+        raise ValueError(f"{page}: {len(parts)} headings, {len(lectures())} lectures")
+    archives = ", ".join(f'<a href="../kit/{name}.zip">{name}.zip</a>' for name in ("student", "teacher", "nbgrader"))
+    text = head.replace("</h1>", f"</h1><p>Notebooks: {archives}.</p>", 1)
+    for number, part in enumerate(parts, 1):
+        text += f'</h2><p><a href="../kit/lecture_{number:02d}.html">Slides</a></p>{part}'
+    page.write_text(text, encoding="utf-8")
+
+
 def main(site: Path) -> None:
     folder = site / "kit"
     folder.mkdir(exist_ok=True)
     write_editions(folder)
     write_decks(folder)
+    link_kit(site / "docs" / "lectures.html")
 
 
 if __name__ == "__main__":
