@@ -110,6 +110,10 @@ if ! "${pip[@]}" install --progress-bar off --require-hashes --no-deps --no-comp
   fi
   stop "pip could not install requirements.lock." "The whole log is in $log."
 fi
+# Extras that are there already stay whole: some need other versions than the lock's plain part.
+for extra in "$venv"/extra-*; do
+  if [ -e "$extra" ]; then bash scripts/extra.sh "${extra##*/extra-}" >>"$log" 2>&1 || rm -f "$extra"; fi
+done
 if ! "${pip[@]}" check >>"$log" 2>&1; then
   tail -n 3 "$log" | sed 's/^/  | /' >&2
   stop "requirements.lock does not fit this Python or machine (see the lines above)." "The whole log is in $log."
