@@ -1,4 +1,4 @@
-"""Labs: the solutions of C14 pass under any seed, five wrong answers to each fail for the reason that is theirs."""
+"""Labs: the solutions of C14 pass under any seed, wrong answers fail for the reason that is theirs."""
 
 import functools
 import re
@@ -9,7 +9,7 @@ import nbformat
 import numpy as np
 import pytest
 from f3amd_notebooks.labs import LABS, judge
-from f3amd_notebooks.labs.judging import Counted, grid_of, hidden_data, known
+from f3amd_notebooks.labs.judging import counted, grid_of, hidden_data, known
 
 from f3amd_lib.diffusion import samplers
 from f3amd_lib.diffusion.predictions import guided
@@ -65,7 +65,7 @@ def test_a_solution_passes_whatever_is_drawn(number, seed):
 
 
 WRONG: dict[str, list] = {}
-"""By lab: five wrong answers, and a word of the reason."""
+"""By lab: wrong answers, and a word of the reason."""
 
 
 def two_m(grid):
@@ -109,30 +109,17 @@ WRONG["L2"] = [
 ]
 
 
-def ancestral(variance, redraw=True):
-    """Ancestral steps with another variance of (sigma, sigma', what D does not know)."""
-
-    def walk(denoise, x, grid, rng):
-        for sigma, lower in zip(grid[:-1], grid[1:], strict=True):
-            guess, share = denoise(x, sigma), (lower / sigma) ** 2
-            doubt = max(sigma**2 - np.mean((x - guess) ** 2), 0.0)
-            noise = (rng if redraw else np.random.default_rng(0)).standard_normal(x.shape)
-            x = guess + share * (x - guess) + np.sqrt(variance(sigma, lower, doubt)) * noise
-        return x
-
-    return walk
-
-
-def whole(s, t, doubt):
-    return (t / s) ** 2 * (s**2 - t**2) + (1 - (t / s) ** 2) ** 2 * doubt
+def a_gaussian_as_wide(denoise, x, grid, rng):
+    x = of("L3")["answer"](denoise, x, grid, rng)
+    return x.mean(0) + x.std() * rng.standard_normal(x.shape)
 
 
 WRONG["L3"] = [
     (lambda *given: known("ddim", *given), "hardly fresh noise"),
     (lambda *given: known("ddpm", *given), "spread is lost"),
-    (ancestral(lambda s, t, doubt: s**2 - t**2), "too wide"),
-    (ancestral(whole, redraw=False), "hardly fresh noise"),
-    (lambda denoise, x, grid, rng: known("heun", denoise, x, grid, rng), "evaluations"),
+    (lambda *given: 1.345 * known("ddpm", *given), "too wide"),
+    (a_gaussian_as_wide, "away from two modes"),
+    (lambda denoise, x, grid, rng: of("L3")["answer"](denoise, x, grid[[0, -2, -1]], rng), "evaluations a step"),
 ]
 
 
@@ -142,7 +129,7 @@ def steps(count):
 
 WRONG["L4"] = [
     (steps(lambda tolerance: 8), "8 evaluations whatever is asked"),
-    (steps(lambda tolerance: 600), "600 evaluations whatever is asked"),
+    (steps(lambda tolerance: 100), "100 evaluations whatever is asked"),
     (lambda *given: of("L4")["answer"](*given[:4], 10 * given[4]), "tolerance is missed"),
     (lambda *given: of("L4")["answer"](*given[:4], 0.02 * given[4]), "too many evaluations"),
     (lambda *given: of("L4")["answer"](*given[:4], 1e-9), "more than"),
@@ -167,10 +154,15 @@ def at_one_level(level):
     return answer
 
 
+def line(data, rng):
+    return lambda x, sigma: data.mean(0) + data.var() / (data.var() + sigma**2) * (x - data.mean(0))
+
+
 WRONG["L5"] = [
     (lambda wrong, data, rng: wrong, "as it was before"),
     (shift_alone, "a shift is mended"),
     (lambda wrong, data, rng: lambda x, sigma: data.mean(0) + 0 * x, "low levels"),
+    (lambda wrong, data, rng: line(data, rng), "`wrong` is never asked"),
     (lambda wrong, data, rng: lambda x, sigma: x, "high levels"),
     (at_one_level(1.0), "harm is left"),
 ]
@@ -180,27 +172,21 @@ def kernel(level):
     """The exact denoiser of the samples themselves, told another level."""
 
     def answer(data, rng):
-        few = data[:500]
-
         def denoise(x, sigma):
-            far = np.square(x[:, None] - few).sum(-1) / (2 * level(sigma) ** 2)
+            far = np.square(x[:, None] - data).sum(-1) / (2 * level(sigma) ** 2)
             share = np.exp(far.min(1, keepdims=True) - far)
-            return share @ few / share.sum(1, keepdims=True)
+            return share @ data / share.sum(1, keepdims=True)
 
         return denoise
 
     return answer
 
 
-def line(data, rng):
-    return lambda x, sigma: data.mean(0) + data.var() / (data.var() + sigma**2) * (x - data.mean(0))
-
-
 WRONG["L6"] = [
     (line, "no better than a line"),
     (lambda data, rng: lambda x, sigma: data.mean(0) + 0 * x, "low levels"),
     (lambda data, rng: lambda x, sigma: x, "high levels"),
-    (kernel(lambda sigma: max(sigma, 1.0)), "low levels"),
+    (kernel(lambda sigma: sigma), "the posterior mean over the points"),
     (kernel(lambda sigma: 0.2), "high levels"),
 ]
 
@@ -215,6 +201,16 @@ def turned(denoise, x, sigma, rng):
     return 2 * prior - of("L7")["answer"](denoise, x, sigma, rng)
 
 
+class Silent:
+    """A generator without noise, and without probes."""
+
+    def standard_normal(self, shape):
+        return np.zeros(shape)
+
+    def choice(self, signs, shape):
+        return np.zeros(shape)
+
+
 def without_norm(denoise, x, sigma, rng):
     return of("L7")["answer"](denoise, x, sigma, rng) + x.shape[1] * np.log(np.sqrt(2 * np.pi) * 80)
 
@@ -223,31 +219,25 @@ WRONG["L7"] = [
     (turned, "wrong sign"),
     (prior_alone, "change on the way is missing"),
     (without_norm, "prior is not whole"),
+    (lambda denoise, x, sigma, rng: of("L7")["answer"](denoise, x, sigma, Silent()), "its trace, is missing"),
+    (lambda *given: np.full(len(given[1]), of("L7")["answer"](*given).mean()), "single answers are not right"),
     (solution("L7", steps=5), "steps are too long"),
     (solution("L7", steps=300, probes=1), "evaluations are used"),
 ]
 
 
-def flown(*pair, scale=lambda w: w, name="ddim"):
-    """A guided walk of a sampler of the library."""
+def flown(*pair):
+    """A guided walk of DDIM."""
     return lambda told, free, x, w, grid, rng: known(
-        name, guided(*[(told, free)[place] for place in pair], scale(w)), x, grid, rng
+        "ddim", guided(*[(told, free)[place] for place in pair], w), x, grid
     )
-
-
-def without_noise(told, free, x, w, grid, rng):
-    class Silent:
-        def standard_normal(self, shape):
-            return np.zeros(shape)
-
-    return of("L8")["answer"](told, free, x, w, grid, Silent())
 
 
 WRONG["L8"] = [
     (flown(0, 1), "variety is lost"),
-    (flown(0, 1, scale=lambda w: 1.0), "too wide"),
+    (lambda told, free, x, w, grid, rng: of("L8")["answer"](told, free, x, 1.6, grid, rng), "too wide"),
     (flown(1, 0), "wrong side"),
-    (without_noise, "variety is lost"),
+    (lambda told, free, x, w, grid, rng: of("L8")["answer"](told, free, x, w, grid, Silent()), "variety is lost"),
     (solution("L8", staying=45), "evaluations"),
 ]
 
@@ -287,8 +277,8 @@ def most(denoisers, image, rng):
 WRONG["L10"] = [
     (most, "fewer than by chance"),
     (lambda denoisers, image, rng: 3, "no denoiser was asked"),
-    (solution("L10", levels=(40.0,)), "nearest mean"),
-    (lambda denoisers, image, rng: np.argmin([np.abs(d(image[None], 0.0) - image).sum() for d in denoisers]), "alike"),
+    (solution("L10", levels=(40.0,)), "mean of its digit alone"),
+    (lambda ten, image, rng: np.argmin([np.abs(one(image[None], 0.3) - image).sum() for one in ten]), "little noise"),
     (solution("L10", levels=tuple(np.geomspace(0.5, 4, 21)), copies=1), "evaluations"),
 ]
 
@@ -310,10 +300,10 @@ def test_evaluations_are_counted_in_rows_and_not_inside_a_compiled_walk():
         lambda y, s: denoise(np.tile(y, (3, 1)), s)[: len(y)], x, *given
     )
     assert "24 evaluations" in judge("L1", at_once, 0).fault
-    asked = Counted(hidden_data(np.random.default_rng(0))[0].whole.denoise, 10)
+    asked, used = counted(hidden_data(np.random.default_rng(0))[0].whole.denoise, 10, size=4)
     slope = jax.vmap(jax.grad(lambda place: asked(place[None], 0.5)[0]))(np.ones(4))
-    assert slope.shape == (4,) and asked.used == 1
+    assert slope.shape == (4,) and used() == 1 and not vars(asked)
 
 
-def test_five_wrong_answers_are_tried_in_every_lab():
-    assert {number: len(answers) for number, answers in WRONG.items()} == dict.fromkeys(LABS, 5)
+def test_five_wrong_answers_or_more_are_tried_in_every_lab():
+    assert list(WRONG) == list(LABS) and min(map(len, WRONG.values())) >= 5

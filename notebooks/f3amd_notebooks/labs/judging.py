@@ -26,36 +26,38 @@ class Verdict:
     fault: str | None
 
 
-class Counted:
-    """A denoiser that counts how often it is asked.
+def counted(denoise: Callable, most: int, size: int) -> tuple[Callable, Callable]:
+    """Close over a denoiser and a count, so that an answer finds neither.
 
-    Attributes:
+    Args:
+      denoise: the exact one.
       most: asked more often, it refuses.
-      rows: points of one evaluation; a call with twice as many counts twice. By default every call counts once.
-      used: evaluations until now.
+      size: numbers of one evaluation, points times dimensions; a call with twice as many counts twice.
+
+    Returns:
+      The denoiser to be asked, and a function that returns the evaluations until now.
     """
+    used = 0
 
-    def __init__(self, denoise: Callable, most: int, rows: int | None = None):
-        self.denoise, self.most, self.rows, self.used = denoise, most, rows, 0
+    def ask(x, sigma):
+        nonlocal used
+        _beneath(sigma)
+        used += -(-np.size(_beneath(x)) // size)
+        if used > most:
+            raise NotAnswered(f"a denoiser was asked more than {most} times: more evaluations than anybody needs")
+        return denoise(x, sigma)
 
-    def __call__(self, x, sigma):
-        if _is_compiled(x) or _is_compiled(sigma):
-            raise NotAnswered("inside jax.jit or lax.scan evaluations cannot be counted: walk in plain Python")
-        self.used += 1 if self.rows is None else -(-len(x) // self.rows)
-        if self.used > self.most:
-            raise NotAnswered(f"a denoiser was asked more than {self.most} times: more evaluations than anybody needs")
-        return self.denoise(x, sigma)
+    return ask, lambda: used
 
 
-def _is_compiled(x) -> bool:
-    """Return whether a program is being written down with x in it; derivatives alone are no obstacle."""
+def _beneath(x):
+    """Return what derivatives and maps of JAX wrap; NotAnswered while a program is being written down with x in it."""
     loaded = sys.modules.get("jax")
     while loaded and isinstance(x, loaded.core.Tracer):
-        if hasattr(x, "primal") or hasattr(x, "batch_dim"):
-            x = x.primal if hasattr(x, "primal") else x.val
-        else:
-            return True
-    return False
+        if not (hasattr(x, "primal") or hasattr(x, "batch_dim")):
+            raise NotAnswered("inside jax.jit or lax.scan evaluations cannot be counted: walk in plain Python")
+        x = x.primal if hasattr(x, "primal") else x.val
+    return x
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,6 +139,13 @@ def points(found, shape: tuple[int, ...]) -> np.ndarray:
     if not np.isfinite(found).all():
         raise NotAnswered("not all numbers are finite")
     return found
+
+
+def distance(samples, places, weights) -> float:
+    """Return the Wasserstein distance of samples [N] to a density on a grid of places, [M] each."""
+    rank = np.cumsum(weights)
+    middle = (np.arange(len(samples)) + 0.5) / len(samples)
+    return float(np.abs(np.sort(samples) - np.interp(middle, rank / rank[-1], places)).mean())
 
 
 def geometric(values) -> float:
