@@ -172,6 +172,8 @@ _BLURS = 0.3, 0.5
 def which_digit(answer, rng: np.random.Generator) -> Verdict:
     """Judge `answer(denoisers, image, rng)`: the digit of an image, by ten denoisers that each know one digit."""
     images, labels, unseen, truth = digits()
+    order = rng.permutation(len(truth))
+    unseen, truth = unseen[order], truth[order]
     blurs = rng.permutation(np.linspace(*_BLURS, 10))
     denoisers, uses = zip(
         *(counted(GaussianMixture(images[labels == digit], blurs[digit]).denoise, 10**6, 64) for digit in range(10)),

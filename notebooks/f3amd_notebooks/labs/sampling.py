@@ -141,7 +141,8 @@ def fresh_noise(answer, rng: np.random.Generator) -> Verdict:
         "your sampler": answer,
     }  # fmt: skip
     grids = [grid_of(np.inf, steps, rng.uniform(15, 30), rng.uniform(0.01, 0.03)) for steps in rng.permutation(_STEPS)]
-    rows = {name: {"alike": 0.0, "evaluations a step": 1.0} for name in walks}
+    columns = [case for case, *_ in cases] + ["two modes: away", "alike", "evaluations a step"]
+    rows = {name: dict.fromkeys(columns, 0.0) | {"evaluations a step": 1.0} for name in walks}
     for (case, data, count), grid in zip(cases, grids, strict=True):
         places = np.linspace(-20, 20, 8001)
         density = np.exp(data.log_density(places[:, None], grid[-1])) if case == "two modes" else None
@@ -161,7 +162,7 @@ def fresh_noise(answer, rng: np.random.Generator) -> Verdict:
     table = pd.DataFrame(rows).T.rename_axis("width left").reset_index()
     mine = rows["your sampler"]
     asked, alike, away = (mine[name] for name in ("evaluations a step", "alike", "two modes: away"))
-    left = {case: mine[case] for case, *_ in cases}
+    left = {case: mine[case] for case in columns[:4]}
     case = max(left, key=lambda case: abs(np.log(left[case])))
     fault = None
     if asked != 1:
