@@ -165,7 +165,7 @@ def write_decks(folder: Path) -> None:
     exporter.register_preprocessor(hide, enabled=True)
     for number, lecture in enumerate(given, 1):
         text, _ = exporter.from_notebook_node(deck(lecture, notebooks))
-        (folder / f"lecture_{number:02d}.html").write_text(text, encoding="utf-8")
+        (folder / f"lecture_{number}.html").write_text(text, encoding="utf-8")
     for name in REVEAL:
         (folder / "reveal" / name).parent.mkdir(parents=True, exist_ok=True)
         # The theme asks for a font that no slide needs.
@@ -260,14 +260,12 @@ def write_archive(path: Path, files: dict) -> None:
 
 def link_kit(page: Path) -> None:
     """Put links to the kit into the page of the sheets; ValueError where it has not a heading for each lecture."""
-    head, *parts = page.read_text(encoding="utf-8").split("</h2>")
-    if len(parts) != len(lectures()):
-        raise ValueError(f"{page}: {len(parts)} headings, {len(lectures())} lectures")
+    slides = r'\g<0><p><a href="../kit/lecture_\1.html">Slides</a></p>'
+    text, found = re.subn(r"<h2>Lecture (\d+).*?</h2>", slides, page.read_text(encoding="utf-8"))
+    if found != len(lectures()):
+        raise ValueError(f"{page}: {found} headings, {len(lectures())} lectures")
     archives = ", ".join(f'<a href="../kit/{name}.zip">{name}.zip</a>' for name in ("student", "teacher", "nbgrader"))
-    text = head.replace("</h1>", f"</h1><p>Notebooks: {archives}.</p>", 1)
-    for number, part in enumerate(parts, 1):
-        text += f'</h2><p><a href="../kit/lecture_{number:02d}.html">Slides</a></p>{part}'
-    page.write_text(text, encoding="utf-8")
+    page.write_text(text.replace("</h1>", f"</h1><p>Notebooks: {archives}.</p>", 1), encoding="utf-8")
 
 
 def main(site: Path) -> None:

@@ -77,11 +77,11 @@ def test_a_deck_has_each_figure_with_its_caption_and_loads_nothing_from_outside(
         (folder / f"{name}.zip").touch()
     sheets = tmp_path / "docs" / "lectures.html"
     sheets.parent.mkdir()
-    sheets.write_text("<h1>Lectures</h1><h2>one</h2>", encoding="utf-8")
+    sheets.write_text("<h1>Lectures</h1><h2>Lecture 1: one</h2><h2>Contents</h2>", encoding="utf-8")
     KIT.link_kit(sheets)
     (tmp_path / "_static" / "mathjax").mkdir(parents=True)
     (tmp_path / "_static" / "mathjax" / "tex-svg-full.js").touch()
-    page = (folder / "lecture_01.html").read_text(encoding="utf-8")
+    page = (folder / "lecture_1.html").read_text(encoding="utf-8")
     assert page.count("<img") == 6 and "Left: per step, Heun beats Euler" in page and "def answer" not in page
     check = [sys.executable, str(ROOT / "docs" / "check_links.py"), str(tmp_path)]
     found = subprocess.run(check, capture_output=True, text=True)
