@@ -9,4 +9,4 @@ wing of their own, `text`. What measures, judges, times, serves and exports is `
 Importing the package imports none of its rooms, so that looking at a BVH file does not start JAX.
 """
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
