@@ -183,7 +183,8 @@ def test_playing_keeps_time_and_starts_again_at_the_end(browser, alone):
     assert again > 0 and time[again + 1] < 20
     # 30 frames a second by the page's own clock, until the last frame is reached.
     first = slice(1, int(np.argmax(time == FRAMES - 1)))
-    if np.diff(milliseconds[first]).max(initial=0) < 200:  # longer gaps are cut, and do not tell
+    gaps = np.diff(milliseconds[first])
+    if len(gaps) > 5 and gaps.max() < 200:  # longer gaps are cut, and do not tell
         slope = np.polyfit(milliseconds[first], time[first], 1)[0]
         assert slope == pytest.approx(0.03, rel=0.15)
 
