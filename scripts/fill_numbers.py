@@ -71,7 +71,8 @@ def _speed() -> dict[str, str]:
 
 def _quality() -> dict[str, str]:
     quality = committed_quality("bandai")
-    slides = quality.query("metric == 'slide_speed' and window_frames == 32 and steps != 1").groupby("model")["value"].mean()
+    slid = quality.query("metric == 'slide_speed' and window_frames == 32 and steps != 1")
+    slides = slid.groupby("model")["value"].mean()
     names = {"real": "real", "steady": STEADY, "camdm": "CAMDM", "fno": FNO}
     told = {f"{name}_slide": f"{slides[model]:.0f}" for name, model in names.items()}
     fid = quality.query("metric == 'FID' and steps == 1").set_index("model")["value"]
