@@ -8,6 +8,7 @@ import sys
 import tempfile
 import threading
 import time
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -22,6 +23,8 @@ def set_environment() -> None:
     cache = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(cache, "f3amd/jax").expanduser()))
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
+    # A program that the cache cannot give or take is compiled, as on the first day.
+    warnings.filterwarnings("ignore", message="Error (reading|writing) persistent compilation cache entry")
 
 
 def check_there(*files: Path | str | None) -> None:
