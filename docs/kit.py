@@ -168,8 +168,9 @@ def write_decks(folder: Path) -> None:
         (folder / f"lecture_{number}.html").write_text(text, encoding="utf-8")
     for name in REVEAL:
         (folder / "reveal" / name).parent.mkdir(parents=True, exist_ok=True)
-        # The theme asks for a font that no slide needs.
-        content = re.sub(rb"@import url\([^)]*\);?", b"", package_file("reveal.js", name))
+        content = package_file("reveal.js", name)
+        if name.startswith("dist/theme/"):  # it asks for a font that no slide needs
+            content = re.sub(rb"@import url\([^)]*\);?", b"", content)
         (folder / "reveal" / name).write_bytes(content)
 
 
@@ -191,9 +192,9 @@ def solutions() -> dict[str, list]:
     return found
 
 
-def editions() -> dict[str, dict[str, object]]:
+def editions(answers: dict[str, list]) -> dict[str, dict[str, object]]:
     """Return notebooks by path for students, and for teachers with each solution under its question."""
-    answers, made = solutions(), {"student": {}, "teacher": {}}
+    made = {"student": {}, "teacher": {}}
     paths = sorted(path for pattern in TAUGHT for path in NOTEBOOKS.glob(f"{pattern}.ipynb"))
     for path in paths:
         name = path.relative_to(NOTEBOOKS).with_suffix("").as_posix()
@@ -207,13 +208,12 @@ def editions() -> dict[str, dict[str, object]]:
     return made
 
 
-def nbgrader_labs(seeds=(11, 12)) -> dict[str, object]:
+def nbgrader_labs(answers: dict[str, list], seeds=(11, 12)) -> dict[str, object]:
     """Return a notebook a lab with nbgrader's marks: stub, solution, and a point if the judge passes hidden seeds."""
-    answers, cells, made = solutions(), read("course/13_labs").cells, {}
-    for text, cell in zip(cells[:-1], cells[1:], strict=True):
+    labs, made, call = read("course/13_labs"), {}, re.compile(r"^lab\(.*\n?", re.M)
+    for text, cell in zip(labs.cells[:-1], labs.cells[1:], strict=True):
         if not (number := asked(cell)):
             continue
-        call = re.compile(r"^lab\(.*\n?", re.M)
         stub, solved = call.sub("", cell.source).rstrip(), call.sub("", answers[number][1].source).rstrip()
         source = f"{stub}\n\n\n### BEGIN SOLUTION\n{solved}\n### END SOLUTION"
         tests = (
@@ -231,7 +231,7 @@ def nbgrader_labs(seeds=(11, 12)) -> dict[str, object]:
                 new_code_cell(tests, metadata={"nbgrader": mark | {
                     "grade": True, "solution": False, "locked": True, "points": 1, "grade_id": f"{number}-judge"}}),
             ],
-            metadata=read("course/13_labs").metadata,
+            metadata=labs.metadata,
         )  # fmt: skip
     return made
 
@@ -246,9 +246,10 @@ c.ExecutePreprocessor.timeout = 600
 
 def write_editions(folder: Path) -> None:
     """Write the archives for students, for teachers, and for nbgrader."""
-    for edition, notebooks in editions().items():
+    answers = solutions()
+    for edition, notebooks in editions(answers).items():
         write_archive(folder / f"{edition}.zip", {f"{edition}/{name}.ipynb": each for name, each in notebooks.items()})
-    labs = {f"nbgrader/source/{number}/{number}.ipynb": each for number, each in nbgrader_labs().items()}
+    labs = {f"nbgrader/source/{number}/{number}.ipynb": each for number, each in nbgrader_labs(answers).items()}
     write_archive(folder / "nbgrader.zip", labs | {"nbgrader/nbgrader_config.py": NBGRADER_CONFIG})
 
 

@@ -27,7 +27,7 @@ from f3amd_lib.ground.profiles import load_profile  # noqa: E402
 from f3amd_lib.motion.bvh import read_bvh  # noqa: E402
 from f3amd_lib.motion.skeleton import resample  # noqa: E402
 from f3amd_lib.training.checkpoints import load_model  # noqa: E402
-from f3amd_lib.training.pipeline import prepare  # noqa: E402
+from f3amd_lib.training.pipeline import PRETRAINED_DIR, prepare  # noqa: E402
 
 CROWD = ("--characters", "64", "--seconds", "8", "--plan", "--pictures")
 
@@ -41,9 +41,8 @@ def write_first(site: Path) -> None:
     walks = [Scene(read_bvh(folder / "media/side_by_side_steady.bvh"), title=f"{model}, ours: 8 steps a window")]
     if os.environ.get(DATA_DIR_VARIABLE):
         packed = prepare(load_profile("laptop", "bandai")).packed
-        real = side_by_side.followed(
-            packed, load_model(side_by_side.PRETRAINED_DIR / f"bandai/{model}.safetensors").config
-        )[-1]
+        config = load_model(PRETRAINED_DIR / f"bandai/{model}.safetensors").config
+        real = side_by_side.followed(packed, config)[-1]
         walks.insert(0, Scene(resample(real, side_by_side.FPS), title="A real clip"))
     write_player(site / "players" / "first.html", walks, strip=False, credit=pages.credit_line(folder))
 

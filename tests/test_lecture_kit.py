@@ -28,7 +28,7 @@ def test_twelve_lectures_name_sections_that_exist_and_fit_into_ninety_minutes():
 
 
 def test_both_editions_have_all_questions_and_one_of_them_the_solutions():
-    made = KIT.editions()
+    made = KIT.editions(KIT.solutions())
     assert made["student"].keys() == made["teacher"].keys() and "course/13_labs" in made["student"]
     found = {}
     for edition, notebooks in made.items():
@@ -54,7 +54,7 @@ def graded(source: str, test: str) -> bool:
 
 
 def test_a_lab_gives_its_point_for_the_solution_and_none_for_the_stub(capsys):
-    labs = KIT.nbgrader_labs()
+    labs = KIT.nbgrader_labs(KIT.solutions())
     assert list(labs) == list(LABS)
     for notebook in labs.values():
         marks = [cell.metadata["nbgrader"] for cell in notebook.cells]
