@@ -37,13 +37,13 @@ from f3amd_lib.ground.names import check_known, checked_seed, checked_value
 from f3amd_lib.ground.profiles import find_model, load_profile, results_dir, runs_dir
 
 with epy.lazy_imports():
+    import jax
     import numpy as np
     import pandas as pd
     import safetensors
 
     from f3amd_companion import reproduce as notebook_runs
     from f3amd_companion.ledger import claims as ledger
-    from f3amd_companion.ledger import model_cards
     from f3amd_companion.measuring import campaign as long_queue
     from f3amd_companion.measuring import measure as measuring
     from f3amd_companion.measuring import paper_tables, runner, text_tables
@@ -821,11 +821,6 @@ def claims(accept: bool = False, paper: str | None = None) -> int:
     return ledger.main(accept, paper)
 
 
-def cards() -> int:
-    """Write the cards of shipped weights, their checksums and the table of docs/results.md."""
-    return model_cards.main()
-
-
 def convert(
     weights: Positional[Path], family: str, to: str, preset: str = "", statistics: Path | None = None,
     autoencoder: Path | None = None, text_weights: Path | None = None, source: Path | None = None,
@@ -856,7 +851,11 @@ def convert(
     encoder = released.released_encoder(family, text_weights, source)
     trained = _say_model(released.read_released(weights, family, encoder=encoder, **options))
     text_models.save_text_model(target, trained, np.dtype("float32"))
-    _say_written(target, write_whole(target.with_suffix(".md"), model_cards.released_card(trained)))
+    card = Path(__file__).with_name("released_card.template").read_text(encoding="utf-8")
+    parts = [part for part in (trained.params, *trained.parts()[0].values()) if part is not None]
+    count, read_by = sum(leaf.size for leaf in jax.tree.leaves(parts)), trained.text_encoder or "reads no captions"
+    told = {"trained": trained, "record": trained.record, "kind": trained.kind, "count": count, "encoder": read_by}
+    _say_written(target, write_whole(target.with_suffix(".md"), card.format(**told)))
 
 
 def reproduce(
@@ -919,7 +918,7 @@ RESUMED = ("train", "crowd", "bench", "measure", "campaign", "sweep", "figures",
 
 COMMANDS = (
     data, joints, dataset, styles, presets, train, rollout, text, crowd, export, steer, bench, measure, campaign, sweep,
-    figures, course, claims, cards, convert, reproduce,
+    figures, course, claims, convert, reproduce,
 )  # fmt: skip
 
 

@@ -6,13 +6,13 @@ import json
 import re
 import shlex
 
+import model_cards
 import pandas as pd
 import pytest
 from builders import captioned_walks
+from model_cards import measured_table
 
 from f3amd_companion.__main__ import main
-from f3amd_companion.ledger import model_cards
-from f3amd_companion.ledger.model_cards import measured_table
 from f3amd_lib.ground.profiles import repository_root
 from f3amd_lib.ground.stored import committed_table
 from f3amd_lib.ground.tables import fill_tables
@@ -33,7 +33,7 @@ TEXT = [path for path in SHIPPED if path.parent.name == "text" and path != JUDGE
 @pytest.mark.parametrize("path", WALKERS + TEXT, ids=lambda path: path.stem)
 def test_every_shipped_model_has_its_card(path):
     card, record = path.with_suffix(".md").read_text(encoding="utf-8"), describe(path)["record"]
-    assert card == model_cards.card_of(path), "write the cards anew: f3amd cards"
+    assert card == model_cards.card_of(path), "write the cards anew: python scripts/model_cards.py"
     assert record["dataset_licence"] in card and record["dataset_credit"] in card
     assert ("non-commercial" in card) == ("NC" in record["dataset_licence"])
     recipe = record.get("training") or record["identity"]["training"]  # of the last leg, where there were several
@@ -43,7 +43,7 @@ def test_every_shipped_model_has_its_card(path):
 
 def test_the_judge_has_its_card_with_figures_of_its_own_alone():
     card = JUDGE.with_suffix(".md").read_text(encoding="utf-8")
-    assert card == model_cards.card_of(JUDGE), "write the cards anew: f3amd cards"
+    assert card == model_cards.card_of(JUDGE), "write the cards anew: python scripts/model_cards.py"
     table, record = committed_table("bandai", "text_judge")
     assert record["judge_weights"] in card and "captions of other clips" in card and "non-commercial" in card
     other = model_cards.judge_card(JUDGE, (table, record | {"judge_weights": "another"}))
@@ -79,7 +79,7 @@ def test_the_command_on_a_text_card_asks_for_the_training_that_its_record_tells(
 def test_page_of_results_shows_what_is_on_record():
     page = (repository_root() / "docs" / "results.md").read_text(encoding="utf-8")
     table = measured_table(model_cards.committed_quality("bandai"))
-    assert fill_tables(page, {"measured": table}, "results.md") == page, "write the table anew: f3amd cards"
+    assert fill_tables(page, {"measured": table}, "results.md") == page, "run scripts/model_cards.py"
 
 
 def test_checksums_are_those_of_the_files():

@@ -1,23 +1,26 @@
 """A card for every model that ships: what it is, its data, how well it does, its limits.
 
-    f3amd cards        # writes cards, checksums and the table of docs/results.md
+    python scripts/model_cards.py  # writes cards, checksums and the table of docs/results.md
 
 Everything on a card is read from the weights file and from committed results; nothing is typed in.
 """
 
+from __future__ import annotations
+
 import hashlib
 import re
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import jax
 import pandas as pd
 
-from f3amd_lib.ground import log
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this tree's library, whatever is installed
+
 from f3amd_lib.ground.files import read_toml, write_whole
 from f3amd_lib.ground.names import counted_cores
 from f3amd_lib.ground.papers import load_paper_file
-from f3amd_lib.ground.profiles import repository_root
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.ground.stored import committed_table
 from f3amd_lib.ground.tables import figure_text, fill_tables, markdown_table
@@ -27,16 +30,18 @@ from f3amd_lib.measures.registry import METRICS, SHOWN, Metric
 from f3amd_lib.networks.presets import find_preset
 from f3amd_lib.papers.printed import SCHEMAS
 from f3amd_lib.text.judge.text_judge import load_judge
-from f3amd_lib.text.stages.text_models import JUDGE, CaptionedModel, is_latent_preset, load_text_model
+from f3amd_lib.text.stages.text_models import JUDGE, is_latent_preset, load_text_model
 from f3amd_lib.training.checkpoints import load_model
 from f3amd_lib.training.pipeline import PRETRAINED_DIR
 
-_CARDS = read_toml(Path(__file__).with_name("cards.toml"))
+ROOT = Path(__file__).resolve().parents[1]
+_FOLDER = ROOT / "scripts" / "cards"
+_CARDS = read_toml(_FOLDER / "limits.toml")
 _OF_HANDS = ["motions", "asked_hand", "other_hand", "both_hands", "no_hand"]
 _OF_JUDGE = ["text_FID", "R_precision_1", "R_precision_3", "matching_distance"]
 
 
-MEASURED_COLUMNS = pd.read_csv(Path(__file__).with_name("results_columns.csv"))
+MEASURED_COLUMNS = pd.read_csv(_FOLDER / "results_columns.csv")
 """Headings of the columns of docs/results.md, with their model and steps."""
 
 
@@ -104,7 +109,7 @@ def _filled(name: str, path: Path, trained, params, measured: pd.DataFrame | Non
     """Fill the template of a card: `fields`, and what all cards say of a file, its weights and its training."""
     record, says = trained.record, _CARDS["measured" if measured is not None else "unmeasured"][name]
     non_commercial = "NC" in re.split(r"[\s-]+", record["dataset_licence"])
-    return Path(__file__).with_name(f"{name}.template").read_text(encoding="utf-8").format(
+    return (_FOLDER / f"{name}.template").read_text(encoding="utf-8").format(
         trained=trained, record=record, file=path.name, megabytes=path.stat().st_size / 1e6,
         count=sum(leaf.size for leaf in jax.tree.leaves(params)),
         weights_type=describe(path).get("weights", "bfloat16"), date=record["date_utc"][:10],
@@ -224,15 +229,6 @@ def judge_card(path: Path, seen: tuple[pd.DataFrame, dict] | None) -> str:
     return _filled("judge_card", path, judge, judge.params, wide, digest=digest, **fields)
 
 
-def released_card(trained: CaptionedModel) -> str:
-    """Write the card of a model that `text.released` read."""
-    params = [part for part in (trained.params, *trained.parts()[0].values()) if part is not None]
-    return Path(__file__).with_name("released_card.template").read_text(encoding="utf-8").format(
-        trained=trained, record=trained.record, kind=trained.kind, weights_type="float32",
-        count=sum(leaf.size for leaf in jax.tree.leaves(params)), encoder=trained.text_encoder or "reads no captions",
-    )  # fmt: skip
-
-
 def committed_quality(dataset: str) -> pd.DataFrame | None:
     """Return what is on record for the models of a data set, with the weights of each row.
 
@@ -285,11 +281,9 @@ def write_cards(folder: Path = PRETRAINED_DIR) -> list[Path]:
     return [write_whole(path.with_suffix(".md"), card_of(path)) for path in weights]
 
 
-def main() -> int:
-    """Write all cards and the table of docs/results.md; see the module's first lines."""
+if __name__ == "__main__":
     for card in write_cards():
-        log.info("%s", card)
-    page = repository_root() / "docs" / "results.md"
+        print(card)
+    page = ROOT / "docs" / "results.md"
     table = measured_table(committed_quality("bandai"))
     write_whole(page, fill_tables(page.read_text(encoding="utf-8"), {"measured": table}, str(page)))
-    return 0
