@@ -81,7 +81,3 @@ def test_exact_one_step_hits_the_wall_eight_choose_and_a_given_side_needs_no_cho
         assert np.isnan(table.loc[(1, False), "as_told"])
 
 
-# ------------------------------------------------------------------------------------- networks
-
-
-# ------------------------------------------------------------------------------- ways in one step

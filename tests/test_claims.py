@@ -634,12 +634,6 @@ def test_networks_that_the_queue_trained_alike_are_shown_and_decide_nothing(tmp_
     assert "at 800,000 windows" in str(snapshots(tmp_path / "twice", [*alike, *longer]).ours[0].sources[0])
 
 
-# ---------------------------------------------------------------------------- intervals of times
-
-
-# ------------------------------------------------------------------------------- other convictions
-
-
 # ------------------------------------------------------------------------- whose records decide
 
 
@@ -712,9 +706,6 @@ def read(*statements, ids=("Q1",)):
 def test_a_broken_statement_is_an_error(statement, message):
     with pytest.raises(ValueError, match=f"f.toml, claim Q1, '{statement['says']}': .*{message}"):
         read(statement)
-
-
-# ----------------------------------------------------------------------- the paper's own tables
 
 
 # ---------------------------------------------------------------------------- the ledger itself

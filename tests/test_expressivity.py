@@ -130,4 +130,3 @@ def test_three_blocks_of_two_channels_have_all_eight_delays():
     np.testing.assert_allclose(out, [np.roll(signal, delay) for delay in delays], atol=1e-5)
 
 
-# ------------------------------------------------------------------------------- ways of c in

@@ -427,9 +427,6 @@ def test_latent_consistency_is_distilled_without_phases():
     assert loss == pytest.approx(float(wanted.mean()), rel=1e-4) and set(terms) == {"loss", "consistency"}
 
 
-# ----------------------------------------------------------------------------------------------------------------- toy
-
-
 # ------------------------------------------------------------------------------------------------------------ sampling
 
 

@@ -198,4 +198,3 @@ def test_held_out_loss_is_measured_on_the_same_noise_every_time(finished):
     assert history[-1]["held_out_far"] == pytest.approx(first["far"], rel=1e-6)
 
 
-# ------------------------------------------------------------------------------- several players

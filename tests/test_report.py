@@ -202,4 +202,3 @@ def test_saved_figures_depend_on_the_drawing_alone(tmp_path):
     refused(r"written as \.png", draw, tmp_path / "figure.pdf")
 
 
-# ------------------------------------------------------------------------------------- pictures
