@@ -18,6 +18,7 @@ import pandas as pd
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this tree's library, whatever is installed
 
+from f3amd_companion.ledger.evidence import committed_quality
 from f3amd_lib.ground.files import read_toml, write_whole
 from f3amd_lib.ground.names import counted_cores
 from f3amd_lib.ground.papers import load_paper_file
@@ -25,7 +26,6 @@ from f3amd_lib.ground.records import read_table
 from f3amd_lib.ground.stored import committed_table
 from f3amd_lib.ground.tables import figure_text, fill_tables, markdown_table
 from f3amd_lib.ground.trees import describe, weights_digest
-from f3amd_lib.measures.distributions import intervals_over_repeats
 from f3amd_lib.measures.registry import METRICS, SHOWN, Metric
 from f3amd_lib.networks.presets import find_preset
 from f3amd_lib.papers.printed import SCHEMAS
@@ -227,29 +227,6 @@ def judge_card(path: Path, seen: tuple[pd.DataFrame, dict] | None) -> str:
     if seen is not None and seen[1]["judge_weights"] == digest:
         wide, fields = _wide(seen[0], "system", _OF_JUDGE), {"repeats": seen[1]["settings"]["repeats"]}
     return _filled("judge_card", path, judge, judge.params, wide, digest=digest, **fields)
-
-
-def committed_quality(dataset: str) -> pd.DataFrame | None:
-    """Return what is on record for the models of a data set, with the weights of each row.
-
-    Means and intervals of the protocol, and of `measure walking` (its intervals are over seeds).
-    """
-    tables, keys = [], ["model", "window_frames", "steps"]
-    if found := committed_table(dataset, "quality"):
-        weights = committed_table(dataset, "quality_by_seed")[0][[*keys, "weights"]].drop_duplicates(keys)
-        tables.append(found[0].merge(weights, on=keys, how="left"))
-    if found := committed_table(dataset, "walking"):
-        tables.append(_walking_rows(found[0]))
-    return pd.concat(tables, ignore_index=True) if tables else None
-
-
-def _walking_rows(walking: pd.DataFrame) -> pd.DataFrame:
-    """Sum `records/walking.csv` up in the form of the protocol's table."""
-    # The protocol has its own acceleration.
-    figures = [one.name for one in SHOWN["card"] if one.name in walking and one.name != "joint_acceleration"]
-    columns = ["model", "window_frames", "steps", "weights"]
-    means = walking.fillna({"weights": ""}).groupby([*columns, "seed"], sort=False)[figures].mean().reset_index()
-    return intervals_over_repeats(means.melt([*columns, "seed"], var_name="metric"), [*columns, "metric"])
 
 
 def card_of(path: Path) -> str:

@@ -33,7 +33,7 @@ if version("jaxlib") == "0.10.2":  # half of that time; XLA ends a process that 
 import jax
 import numpy as np
 import pandas as pd
-from model_cards import card_of, committed_quality, measured_table
+from model_cards import card_of, measured_table
 from safetensors.numpy import load_file
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this tree's library, whatever is installed
@@ -45,6 +45,7 @@ from f3amd_notebooks.quality_tables import QUALITY_TABLES, of_queue, quality_mar
 from f3amd_notebooks.readings import readings_table
 
 from f3amd_companion.ledger.claims import judge_claims, ledger, ledger_markdown
+from f3amd_companion.ledger.evidence import committed_quality
 from f3amd_companion.measuring.consistency_task import distil
 from f3amd_companion.serving.artefact import JAX_EXPORT, MANIFEST, STABLEHLO, load_artefact
 from f3amd_companion.serving.crowd import generate_crowd

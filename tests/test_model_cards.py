@@ -13,6 +13,7 @@ from builders import captioned_walks
 from model_cards import measured_table
 
 from f3amd_companion.__main__ import main
+from f3amd_companion.ledger.evidence import committed_quality
 from f3amd_lib.ground.profiles import repository_root
 from f3amd_lib.ground.stored import committed_table
 from f3amd_lib.ground.tables import fill_tables
@@ -78,7 +79,7 @@ def test_the_command_on_a_text_card_asks_for_the_training_that_its_record_tells(
 
 def test_page_of_results_shows_what_is_on_record():
     page = (repository_root() / "docs" / "results.md").read_text(encoding="utf-8")
-    table = measured_table(model_cards.committed_quality("bandai"))
+    table = measured_table(committed_quality("bandai"))
     assert fill_tables(page, {"measured": table}, "results.md") == page, "run scripts/model_cards.py"
 
 

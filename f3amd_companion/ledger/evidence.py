@@ -19,7 +19,9 @@ from f3amd_lib.ground.names import asked_network, check_known, counted_cores
 from f3amd_lib.ground.papers import load_paper_file, paper_folders
 from f3amd_lib.ground.profiles import DATASETS, PROFILES
 from f3amd_lib.ground.records import folder_reason, read_table
+from f3amd_lib.ground.stored import committed_table
 from f3amd_lib.measures.distributions import intervals_over_repeats, mean_and_interval
+from f3amd_lib.measures.registry import SHOWN
 from f3amd_lib.papers import printed
 
 
@@ -284,6 +286,29 @@ def recorded_evidence(root, dataset: str, profile: str) -> Evidence:
         return table, record, path.relative_to(root).as_posix()
 
     return Evidence(load, at=lambda share: Evidence(functools.partial(load, length=share)))
+
+
+def committed_quality(dataset: str) -> pd.DataFrame | None:
+    """Return what is on record for the models of a data set, with the weights of each row.
+
+    Means and intervals of the protocol, and of `measure walking` (its intervals are over seeds).
+    """
+    tables, keys = [], ["model", "window_frames", "steps"]
+    if found := committed_table(dataset, "quality"):
+        weights = committed_table(dataset, "quality_by_seed")[0][[*keys, "weights"]].drop_duplicates(keys)
+        tables.append(found[0].merge(weights, on=keys, how="left"))
+    if found := committed_table(dataset, "walking"):
+        tables.append(_walking_rows(found[0]))
+    return pd.concat(tables, ignore_index=True) if tables else None
+
+
+def _walking_rows(walking: pd.DataFrame) -> pd.DataFrame:
+    """Sum `records/walking.csv` up in the form of the protocol's table."""
+    # The protocol has its own acceleration.
+    figures = [one.name for one in SHOWN["card"] if one.name in walking and one.name != "joint_acceleration"]
+    columns = ["model", "window_frames", "steps", "weights"]
+    means = walking.fillna({"weights": ""}).groupby([*columns, "seed"], sort=False)[figures].mean().reset_index()
+    return intervals_over_repeats(means.melt([*columns, "seed"], var_name="metric"), [*columns, "metric"])
 
 
 def of_seeds(table: pd.DataFrame, keys: Sequence[str], length: float = 1.0) -> pd.DataFrame:
