@@ -14,10 +14,8 @@ VENV := $(or $(F3AMD_VENV),.venv)
 PYTHON := $(VENV)/bin/python
 INSTALLED := $(VENV)/installed
 NOTEBOOKS := $(sort $(wildcard notebooks/*.ipynb notebooks/course/*.ipynb notebooks/standalone/*.ipynb))
-# For `make test-slow`: they take 20 to 90 CPU seconds each, where 10 are usual, since they train, search, time or compile whole
-# networks, all by code that has tests of its own. The rest is to stay below 220 in all.
-SLOW_NOTEBOOKS := $(sort $(foreach name,04 06 07 10 11 12 13 14 16 17 20 21 22 $(addprefix course/,06 09 10 11 12 13 14),\
-  $(wildcard notebooks/$(name)_*.ipynb)))
+# What a newcomer opens first, for `make test`; the others are for `make test-slow`.
+FIRST_NOTEBOOKS := $(sort $(foreach name,00 01 02 03 05 course/01 course/04,$(wildcard notebooks/$(name)_*.ipynb)))
 
 export F3AMD_PYTHON
 
@@ -79,14 +77,14 @@ onnx-tools: $(VENV)/extra-onnx ## Add jax2onnx and ONNX Runtime to .venv (about 
 
 sweep-tools: $(VENV)/extra-sweep ## Add Dask distributed to .venv, for f3amd sweep (about 30 MB)
 
-test: lint ## Lint, run the tests but the slow ones, check committed outputs of most notebooks
+test: lint ## Lint, run the tests but the slow ones, check committed outputs of the first notebooks
 	$(PYTEST) $(NO_NOTEBOOKS) tests $(SIDE_BY_SIDE) -m "not slow and not long" $(PYTEST_OPTIONS)
-	$(call COMPARED,$(filter-out $(SLOW_NOTEBOOKS),$(NOTEBOOKS)))
+	$(call COMPARED,$(FIRST_NOTEBOOKS))
 
 # Every preset, whole trainings, several processes: what would make `make test` long.
 test-slow: $(INSTALLED) ## Run the slow tests and notebooks that `make test` leaves out
 	$(PYTEST) $(NO_NOTEBOOKS) $(SIDE_BY_SIDE) $(call MARKED,slow, and not long) $(PYTEST_OPTIONS)
-	$(call COMPARED,$(SLOW_NOTEBOOKS))
+	$(call COMPARED,$(filter-out $(FIRST_NOTEBOOKS),$(NOTEBOOKS)))
 
 test-long: $(INSTALLED) ## Rehearse all commands of the ledger at smoke size, and the notebooks with other seeds
 	$(PYTEST) $(NO_NOTEBOOKS) $(SIDE_BY_SIDE) $(call MARKED,long) $(PYTEST_OPTIONS)

@@ -43,6 +43,7 @@ def test_the_mean_of_all_paths_runs_straight_into_the_wall():
 # ------------------------------------------------------------------------------- exact denoiser
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.3, 2.0, 8.0])
 def test_exact_denoiser_is_the_weighted_mean_over_many_real_paths(sigma):
     paths, side = real_paths(SMALL, 200_000)

@@ -106,6 +106,7 @@ def test_a_planned_crowd_keeps_apart_and_is_drawn_beside_its_folder(weights, tmp
     assert (tmp_path / "crowd.png").stat().st_size > 5000
 
 
+@pytest.mark.slow
 def test_a_crowd_that_was_stopped_while_motions_were_written_goes_on(weights, tmp_path, monkeypatch, capsys):
     out, folder = tmp_path / "crowd", tmp_path / "crowd_motions"
     words = ["crowd", "--weights", weights, "--out", str(out), "--steps", "1", "--seconds", "0.8", "--characters", "3"]
@@ -128,6 +129,7 @@ def test_a_crowd_that_was_stopped_while_motions_were_written_goes_on(weights, tm
     assert before == {file: file.stat().st_mtime_ns for file in before}  # nobody was animated anew
 
 
+@pytest.mark.slow
 def test_a_crowd_is_written_in_the_formats_that_are_asked_for(weights, tmp_path, capsys):
     out, folder = tmp_path / "crowd", tmp_path / "crowd_motions"
     words = ["crowd", "--weights", weights, "--out", str(out), "--steps", "1", "--seconds", "0.8", "--characters", "3"]
@@ -252,6 +254,7 @@ def test_bench_hands_its_options_on_and_starts_jax_with_fast_flags(no_fast_flags
     assert asked["flags"] == "--mine"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", [["bench", "--suite", "bar"], ["campaign", "--times", "--packed", "none.npz"]])
 def test_fast_flags_are_set_before_jax_looks_for_devices(words):
     script = f"""
@@ -415,6 +418,7 @@ sys.exit(command_line.main())
         running.kill()
 
 
+@pytest.mark.slow
 def test_pictures_of_another_crowd_are_not_written_over(weights, tmp_path, capsys):
     out = tmp_path / "crowd"
     words = ["crowd", "--weights", weights, "--out", str(out), "--steps", "1", "--characters", "2"]

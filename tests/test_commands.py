@@ -119,6 +119,7 @@ OF_SEEDS = {"seen once", "not seen at half its length", "not converged: no train
 """What the gate asks beyond the commands: the same for other seeds and lengths."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("claim", claims.load_claims().values(), ids=lambda claim: claim.id)
 def test_a_claims_commands_measure_all_that_its_rule_looks_up(claim, tmp_path):
     """All that the commands would write, and nothing else, is enough to judge every statement."""
@@ -142,6 +143,7 @@ def test_a_claims_commands_measure_all_that_its_rule_looks_up(claim, tmp_path):
     assert {reason for one in judgement.ours for reason in one.reasons} <= OF_SEEDS
 
 
+@pytest.mark.slow
 def test_every_claim_has_a_command_that_the_ledger_prints():
     page = claims.ledger_markdown(claims.judge_claims())
     listed = {run: ids.split(", ") for ids, run in re.findall(r"^# ([\w, ]+)\n(.+)$", page, re.M)}
@@ -192,6 +194,7 @@ def told(part, key: str) -> set[str]:
     return set().union(*(told(value, key) for value in part)) if isinstance(part, list) else set()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("paper", "claim_id"), OF_TEXT)
 def test_a_command_of_text_to_motion_reaches_what_its_claim_is_about(paper, claim_id, monkeypatch):
     """The tables that are measured for it, or the models that have a row there; nothing is done."""

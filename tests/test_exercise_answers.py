@@ -410,6 +410,7 @@ def cases(answers):
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number, answer", cases(RIGHT))
 def test_a_right_answer_passes_in_every_form(number, answer):
     assert hint(number, answer) is None

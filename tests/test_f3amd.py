@@ -184,6 +184,7 @@ VARIANTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_tables_8_to_11_every_variant_is_its_own_function(variant):
     network, x_noisy = make_network(**VARIANTS[variant]), draw(2, WINDOW, CHANNELS)

@@ -68,6 +68,7 @@ def test_one_step_along_the_true_velocity_is_exact():
     np.testing.assert_allclose(walked, x0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_dormand_and_prince_end_where_the_flow_ends():
     """The flow from a standard normal to one Gaussian keeps every point at its quantile."""
     noise, velocity = jnp.linspace(-2.0, 2.0, 9)[:, None], exact("v", straight())

@@ -5,9 +5,11 @@ import subprocess
 import sys
 
 import gpu_package
+import pytest
 from builders import refused
 
 
+@pytest.mark.slow
 def test_a_package_is_laid_out_whole_and_its_command_is_understood_there(tmp_path, cache_dir, capsys):
     folder = tmp_path / "away"
     words = [str(folder), "--package", "A", "--minutes", "9"]

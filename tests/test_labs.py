@@ -57,6 +57,7 @@ def test_a_stub_is_not_yet_and_nobody_falls_over_nonsense(number, capsys):
         assert judge(number, nothing, 0).fault
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 20])
 @pytest.mark.parametrize("number", LABS)
 def test_a_solution_passes_whatever_is_drawn(number, seed):
@@ -283,6 +284,7 @@ WRONG["L10"] = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "number, answer, reason",
     [pytest.param(number, *case, id=f"{number}-{case[1]}") for number in WRONG for case in WRONG[number]],

@@ -188,6 +188,7 @@ def test_each_stage_sees_training_clips_alone_and_keeps_the_weights_that_are_use
         np.testing.assert_allclose(kept.mean, statistics.mean, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("finished", [True, False])
 def test_what_an_earlier_version_began_goes_on_by_the_facing_that_it_knows(data, tmp_path, monkeypatch, finished):
     """Files of earlier versions say nothing of a facing."""

@@ -186,6 +186,7 @@ MILLIONS = {
 """Parameters of the network that makes motion, as the fact sheets count them; of the CLIP evaluator by hand."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", MILLIONS)
 def test_released_shapes_are_those_of_our_networks_at_full_size(which):
     shapes, millions = MILLIONS[which]
@@ -198,6 +199,7 @@ def test_released_shapes_are_those_of_our_networks_at_full_size(which):
     assert count_parameters(configs.get("params") or configs["autoencoder"]) / 1e6 == pytest.approx(millions, rel=2e-3)
 
 
+@pytest.mark.slow
 def test_a_release_says_which_preset_it_is(folder, tmp_path):
     name = lambda model: (model.name, type(model).__name__)
     assert name(read(folder, "acmdm-control")) == ("ACMDM-S-PS22+control", "TextModel")

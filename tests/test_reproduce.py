@@ -97,6 +97,7 @@ def test_plain_papermill_runs_each_kind_of_notebook_from_any_folder(notebook, fo
     assert any((tmp_path / "results").rglob("08_*")) == (notebook == "08_claims.ipynb")
 
 
+@pytest.mark.slow
 def test_plain_papermill_refuses_a_parameter_that_a_notebook_does_not_have(tmp_path):
     call = [sys.executable, "-m", "papermill", str(NOTEBOOKS / "08_claims.ipynb"), "copy.ipynb", "-p", "profle", "gpu"]
     done = subprocess.run(call, cwd=tmp_path, capture_output=True, text=True)
@@ -191,6 +192,7 @@ def test_broken_assignments_are_refused(text, capsys):
     assert text.partition("=")[0] in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_course_runs_without_parameters_into_copies_of_its_own(checkout):
     folder = checkout / "notebooks/course"
     folder.mkdir(parents=True)

@@ -22,6 +22,7 @@ def test_machines_take_the_first_leg_that_may_begin(machines, ends):
     assert scaling.finished_after(LEGS, SECONDS, machines) == ends
 
 
+@pytest.mark.slow
 def test_the_page_says_what_the_records_say():
     page = scaling.PAGE.read_text(encoding="utf-8")
     assert scaling.written(page) == page

@@ -37,6 +37,7 @@ def features(motion, window: int = 150) -> np.ndarray:
     return np.concatenate([poses.mean(1), poses.std(1)], axis=-1)
 
 
+@pytest.mark.slow
 def test_styles_can_be_told_apart(all_styles):
     # The nearest of a hundred class means, from clips of another seed; chance is 1 %.
     known = np.stack([features(motion) for motion, _ in all_styles.values()])

@@ -57,6 +57,7 @@ def test_control_guidance_of_one_and_one_is_the_controlled_network(network):
 # ------------------------------------------------------------------------------------------------------- autoregression
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("guidance", [1.0, 2.5])
 def test_cached_and_uncached_blocks_agree(guidance):
     network = Compiled(stirred(fresh(config_of(depth=2, block_frames=3))))  # the last block is short

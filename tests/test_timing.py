@@ -68,6 +68,7 @@ def test_a_processor_without_a_name_has_that_of_its_kind(tmp_path, monkeypatch):
     assert machine._processor() == (platform.processor() or platform.machine())
 
 
+@pytest.mark.slow
 def test_fast_flags_start_jax_with_as_many_devices(monkeypatch):
     monkeypatch.setattr(machine, "_FAST_FLAGS", (*machine._FAST_FLAGS, "--xla_no_such_flag=1"))
     flags = fast_xla_flags(3)

@@ -123,6 +123,7 @@ def test_mixed_noise_draws_half_of_the_levels_below_one():
     assert np.median(sigma[sigma < 1.0]) == pytest.approx(0.1, rel=0.35)
 
 
+@pytest.mark.slow
 def test_loss_falls(task, finished):
     before = held_out_terms(task, initial_state(task), task.windows)
     after = held_out_terms(task, finished[0], task.windows)

@@ -41,6 +41,7 @@ def code_of(path: Path) -> list[str]:
     return [c.source for c in cells if c.cell_type == "code" and "install" not in c.metadata.get("tags", [])]
 
 
+@pytest.mark.slow
 def test_what_the_course_imports_is_there_without_jax(bare):
     asked = {
         ast.unparse(node): None
