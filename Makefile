@@ -116,10 +116,8 @@ site: site-tools onnx-tools ## Build notebooks, claims, gallery and API as a sit
 	rm -rf docs/_build
 	JAX_PLATFORMS=cpu $(PYTHON) -m sphinx -q -j auto -W --keep-going -c docs -d docs/_build/doctrees \
 	  . docs/_build/html
-	JAX_PLATFORMS=cpu $(PYTHON) docs/players.py docs/_build/html
-	JAX_PLATFORMS=cpu $(PYTHON) docs/live.py docs/_build/html
-	$(PYTHON) docs/lite.py docs/_build/html
-	JAX_PLATFORMS=cpu $(PYTHON) docs/kit.py docs/_build/html
+	for part in players live lite kit; do JAX_PLATFORMS=cpu $(PYTHON) docs/$$part.py docs/_build/html & jobs+=" $$!"; done; \
+	  for job in $$jobs; do wait $$job || exit; done
 	$(PYTHON) docs/check_links.py docs/_build/html
 
 lint: $(INSTALLED) ## Check .py and .ipynb files with ruff, and that each import is declared
