@@ -259,7 +259,7 @@ def bandai_text_motions(packed: PackedMotion) -> TextMotions:
         if clip not in labels:
             skipped.append((name, f"no words for content {packed.clip_contents[clip]!r}"))
             continue
-        motion = resample(packed.motion(clip), FPS)
+        motion = resample(packed.motion(clip), FPS, smooth=True)
         motion = motion.slice(0, min(motion.num_frames, MOST_FRAMES) // UNIT * UNIT)
         content, style = shown_content(labels[clip][0], motion), labels[clip][1]
         captions = compose_captions(name, content, style, motion)
