@@ -70,9 +70,7 @@ def test_the_command_on_a_text_card_asks_for_the_training_that_its_record_tells(
     name, config, window = asked.value.args
     record = describe(path)["record"]
     told, network = record["identity"]["training"], record["identity"]["model"]["denoiser"]
-    assert config.num_steps * config.batch_size == record["motions_seen"]
-    # The record is of the last of two goes.
-    assert json.loads(json.dumps(dataclasses.asdict(config))) == told | {"num_steps": config.num_steps}
+    assert json.loads(json.dumps(dataclasses.asdict(config))) == told
     sizes = {"num_joints": network["num_joints"], "text_width": network["text_width"], "window": window}
     assert presets.build_config(name, **sizes).to_dict() == network
 
