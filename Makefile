@@ -116,7 +116,7 @@ site: site-tools onnx-tools ## Build notebooks, claims, gallery and API as a sit
 	rm -rf docs/_build
 	JAX_PLATFORMS=cpu $(PYTHON) -m sphinx -q -j auto -W --keep-going -c docs -d docs/_build/doctrees \
 	  . docs/_build/html
-	for part in players live lite kit; do JAX_PLATFORMS=cpu $(PYTHON) docs/$$part.py docs/_build/html & jobs+=" $$!"; done; \
+	jobs=; for part in players live lite kit; do JAX_PLATFORMS=cpu $(PYTHON) docs/$$part.py docs/_build/html & jobs+=" $$!"; done; \
 	  for job in $$jobs; do wait $$job || exit; done
 	$(PYTHON) docs/check_links.py docs/_build/html
 

@@ -80,5 +80,3 @@ def test_exact_one_step_hits_the_wall_eight_choose_and_a_given_side_needs_no_cho
         assert 0.4 < table.loc[(8, False), "left"] < 0.6
         assert (table.xs(True, level="told")["as_told"] == 1.0).all()
         assert np.isnan(table.loc[(1, False), "as_told"])
-
-

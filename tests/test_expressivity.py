@@ -128,5 +128,3 @@ def test_three_blocks_of_two_channels_have_all_eight_delays():
 
     out = delayed(jnp.repeat(jnp.asarray(bits, jnp.float32)[:, None], 8, axis=1))
     np.testing.assert_allclose(out, [np.roll(signal, delay) for delay in delays], atol=1e-5)
-
-

@@ -196,5 +196,3 @@ def test_held_out_loss_is_measured_on_the_same_noise_every_time(finished):
     _, history = optimise(line(), held_out=held_out, checkpoint_every=STEPS // 2, **QUIET)
     assert [row["step"] for row in history if "held_out_loss" in row] == [STEPS // 2, STEPS]
     assert history[-1]["held_out_far"] == pytest.approx(first["far"], rel=1e-6)
-
-

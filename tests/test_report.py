@@ -200,5 +200,3 @@ def test_saved_figures_depend_on_the_drawing_alone(tmp_path):
         assert image.size == (770, 396)
         assert not {"Software", "Creation Time", "date"} & set(image.info)
     refused(r"written as \.png", draw, tmp_path / "figure.pdf")
-
-

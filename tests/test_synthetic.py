@@ -116,5 +116,3 @@ def test_accelerations_are_human(all_styles):
         assert head.max() < 4.0, style
     # Of real clips elderly walks have 0.2, ordinary ones 0.4, runs 1.8.
     assert 0.15 < np.median(medians) < 0.6
-
-
