@@ -14,13 +14,14 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pandas as pd
+from pages import fill_tables
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this tree's library, whatever is installed
 
 from f3amd_companion.ledger.claims import load_claims
 from f3amd_companion.ledger.evidence import committed_quality
 from f3amd_lib.ground.papers import load_paper_file
-from f3amd_lib.ground.tables import fill_tables, markdown_table
+from f3amd_lib.ground.tables import markdown_table
 from f3amd_lib.networks.presets import find_preset
 from f3amd_lib.training.checkpoints import load_model
 from f3amd_lib.training.pipeline import PRETRAINED_DIR

@@ -29,10 +29,11 @@ import pandas as pd
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this tree's library, whatever is installed
 
+from f3amd_companion.measuring.runner import kept_rows
 from f3amd_lib.data.packed import load_packed, pack, save_packed
 from f3amd_lib.data.sources import open_dataset
 from f3amd_lib.ground.files import whole_file
-from f3amd_lib.ground.records import kept_rows, read_table, write_table
+from f3amd_lib.ground.records import read_table, write_table
 from f3amd_lib.motion.bvh import format_bvh, read_bvh
 from f3amd_lib.motion.root_paths import read_path_csv
 from f3amd_lib.motion.skeleton import Motion, Skeleton

@@ -16,6 +16,7 @@ from functools import partial
 from pathlib import Path
 
 import pandas as pd
+from pages import fill_tables
 from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this tree's library, whatever is installed
@@ -25,7 +26,7 @@ from f3amd_companion.speed.machine import describe_machine
 from f3amd_companion.speed.timing import take_turns
 from f3amd_lib.ground.profiles import find_model
 from f3amd_lib.ground.records import read_table, run_record, write_table
-from f3amd_lib.ground.tables import fill_tables, markdown_table
+from f3amd_lib.ground.tables import markdown_table
 from f3amd_lib.training.checkpoints import load_model
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -16,6 +16,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import pandas as pd
+from pages import fill_tables
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this tree's library, whatever is installed
 
@@ -23,7 +24,7 @@ from f3amd_companion.measuring.campaign import STEPS_MEASURED, queue
 from f3amd_companion.measuring.sweep import CAMPAIGN, Leg, plan
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import read_table
-from f3amd_lib.ground.tables import fill_tables, markdown_table
+from f3amd_lib.ground.tables import markdown_table
 from f3amd_lib.networks import presets
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -13,9 +13,10 @@ import pytest
 from builders import HISTORY, WINDOW, refused, tiny_packed, tiny_task
 
 from f3amd_companion import __main__ as command_line
+from f3amd_companion.measuring.runner import kept_rows
 from f3amd_lib.ground.files import locked
 from f3amd_lib.ground.profiles import load_profile
-from f3amd_lib.ground.records import kept_rows, read_table, write_table
+from f3amd_lib.ground.records import read_table, write_table
 from f3amd_lib.training import pipeline
 from f3amd_lib.training.optimise import TrainingState, optimise
 from f3amd_lib.training.pipeline import PreparedData

@@ -252,7 +252,7 @@ def minutes(packed, monkeypatch, tmp_path):
     judges = SimpleNamespace(params={"a": jnp.ones(1)}), Protocol(STYLES), None
     monkeypatch.setattr(measurements, "plan", lambda suite: {one.group: [one] for one in groups})
     monkeypatch.setattr(measurements, "time_group", time_group)
-    monkeypatch.setattr(measurements, "compile_steps", lambda *_: None)
+    monkeypatch.setattr(measurements, "compiled_steps", lambda *_: (None, 0.0))
     monkeypatch.setattr(measurements, "planned_memory", lambda *_: 0)
     monkeypatch.setattr(measurements, "_TRAINED", ("F3AMD-FNO-32",))
     monkeypatch.setattr(measurements, "training_call", lambda *_: work("training") or (lambda: None))

@@ -11,12 +11,12 @@ import pandas as pd
 import pytest
 from builders import captioned_walks
 from model_cards import measured_table
+from pages import fill_tables
 
 from f3amd_companion.__main__ import main
 from f3amd_companion.ledger.evidence import committed_quality
 from f3amd_lib.ground.profiles import repository_root
 from f3amd_lib.ground.stored import committed_table
-from f3amd_lib.ground.tables import fill_tables
 from f3amd_lib.ground.trees import describe, weights_digest
 from f3amd_lib.motion import synthetic
 from f3amd_lib.networks import presets

@@ -2,9 +2,9 @@
 
 import page_speed
 import pandas as pd
+from pages import fill_tables
 
 from f3amd_lib.ground.records import read_table, run_record, write_table
-from f3amd_lib.ground.tables import fill_tables
 
 
 def test_the_page_has_the_tables_of_the_records():

@@ -3,6 +3,7 @@
 import pandas as pd
 import pytest
 from builders import refused
+from f3amd_notebooks.stored_result import measured_table
 
 from f3amd_lib.ground import records, stored
 from f3amd_lib.ground.profiles import load_profile, repository_root
@@ -26,14 +27,14 @@ def test_committed_tables_are_found_checked_or_absent(tmp_path, monkeypatch):
 
 def test_measured_tables_are_those_of_the_data_set_then_bandais_and_say_so(tmp_path, monkeypatch):
     monkeypatch.setattr(stored, "repository_root", lambda: tmp_path)
-    found, sentence = stored.measured_table("synthetic", "quality", "quality")
+    found, sentence = measured_table("synthetic", "quality", "quality")
     assert found is None
     assert "`make measure MEASURE=quality DATA=bandai`" in sentence
     for dataset, value in (("bandai", 1.0), ("synthetic", 2.0)):
         record = records.run_record(profile=load_profile("laptop", dataset), dataset=dataset, seed=0)
         path = tmp_path / "paper_figures" / dataset / "laptop" / "records" / "quality.csv"
         records.write_table(path, pd.DataFrame({"value": [value]}), record)
-        found, sentence = stored.measured_table("synthetic", "quality", "quality")
+        found, sentence = measured_table("synthetic", "quality", "quality")
         assert found["value"].tolist() == [value]
         assert found.attrs["dataset"] == dataset
         assert f"data {dataset}, profile laptop" in sentence
@@ -83,7 +84,7 @@ def test_a_stale_table_is_marked_for_notebooks(tmp_path, monkeypatch):
         records.write_table(
             folder / "walking.csv", pd.DataFrame({"value": [1.0]}), record | {"weights_digests": {"A": [digest]}}
         )
-        assert stored.measured_table("bandai", "walking", "walking")[1].startswith("**Stale: ") is stale
+        assert measured_table("bandai", "walking", "walking")[1].startswith("**Stale: ") is stale
 
 
 RECORDS = sorted((repository_root() / "paper_figures").glob("*/*/records/*.csv"))

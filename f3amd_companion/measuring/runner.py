@@ -11,7 +11,7 @@ import pandas as pd
 
 from f3amd_lib.ground import log
 from f3amd_lib.ground.profiles import Profile, results_dir
-from f3amd_lib.ground.records import kept_rows, others_rows, run_record, write_table
+from f3amd_lib.ground.records import read_table, record_hash, run_record, set_aside_table, whole_table, write_table
 
 
 def records_folder(profile: Profile) -> Path:
@@ -22,6 +22,43 @@ def records_folder(profile: Profile) -> Path:
 def record_of(profile: Profile, data, measurement: str, **extra) -> dict:
     """Return the run record of a measurement on a data set with a profile's seed."""
     return run_record(profile=profile, dataset=data, seed=profile.seed, measurement=measurement, **extra)
+
+
+def kept_rows(path, record: dict) -> pd.DataFrame | None:
+    """Return the rows of an earlier run with the same settings, so that a stopped run continues.
+
+    A table with other settings is kept under another name, and so is a broken one: a run may
+    have been killed between the table and its record.
+
+    Args:
+      path: of the CSV.
+      record: of the run that wants to go on.
+
+    Returns:
+      The rows; None if there are none.
+    """
+    if (found := whole_table(path)) is None:
+        return None
+    rows, earlier = found
+    if record_hash(earlier) != record_hash(record):
+        kept = set_aside_table(path)
+        log.warning("%s was measured with other settings or data: kept as %s", path, kept.name)
+        return None
+    return _with_empty_texts(rows)
+
+
+def others_rows(path, record: dict) -> pd.DataFrame | None:
+    """Return the rows of another run with the same settings, or None; its table is only read."""
+    try:
+        rows, theirs = read_table(path)
+    except (ValueError, FileNotFoundError):
+        return None
+    return _with_empty_texts(rows) if record_hash(theirs) == record_hash(record) else None
+
+
+def _with_empty_texts(rows: pd.DataFrame) -> pd.DataFrame:
+    """CSV knows no empty text."""
+    return rows.assign(**{column: rows[column].fillna("") for column in ("unit", "weights") if column in rows})
 
 
 class Records:

@@ -35,7 +35,7 @@ from f3amd_lib.networks.conditioning import ConditionEncoder, FiLM
 from f3amd_lib.networks.spectral import FNOBlock
 from f3amd_lib.rollout.rounds import sample_round
 from f3amd_lib.training.denoising_task import DenoisingTask
-from f3amd_lib.training.optimise import compile_steps, initial_state, planned_memory
+from f3amd_lib.training.optimise import advance, initial_state
 from f3amd_lib.training.pipeline import PreparedData
 from f3amd_lib.training.recipe import short_recipe
 
@@ -261,7 +261,15 @@ def compiled_steps(task: DenoisingTask, chunk: int, precision: str):
     """Return (program of `chunk` steps, seconds that compiling took)."""
     started = time.perf_counter()
     with matmul_precision(precision):  # here: what a caller sets does not reach other threads
-        return compile_steps(task, chunk), time.perf_counter() - started
+        program = advance.lower(task, jax.eval_shape(initial_state, task), chunk).compile()
+        return program, time.perf_counter() - started
+
+
+def planned_memory(compiled) -> int:
+    """Return the bytes that the compiler plans for a program: what goes in, what comes out, values between."""
+    plan = compiled.memory_analysis()
+    shared = plan.alias_size_in_bytes  # what goes in and comes out in the same place
+    return int(plan.argument_size_in_bytes + plan.output_size_in_bytes + plan.temp_size_in_bytes - shared)
 
 
 def training_call(task: DenoisingTask, program):

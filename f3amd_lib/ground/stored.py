@@ -34,27 +34,3 @@ def committed_table(dataset: str, name: str, *, profile="laptop", kind="records"
     table, record = read_table(path)
     table.attrs["stale"] = folder_reason(path, record)
     return table, record
-
-
-def measured_table(dataset: str, name: str, measurement: str) -> tuple[pd.DataFrame | None, str]:
-    """Read the committed table of a data set, else that of Bandai, and say where it comes from.
-
-    Args:
-      dataset: a name of `profiles.DATASETS`.
-      name: of the table, without ending.
-      measurement: of `measure.MEASUREMENTS`, which writes it.
-
-    Returns:
-      (table or None, a sentence: data, profile, machine, date and credit, or how to measure it).
-      `table.attrs["dataset"]` names the data set that was measured.
-    """
-    found = committed_table(dataset, name) or committed_table("bandai", name)
-    if found is None:
-        return None, f"Not measured yet: `{name}`. `make measure MEASURE={measurement} DATA=bandai` measures it."
-    table, record = found
-    table.attrs["dataset"] = record["dataset"]
-    where = f"data {record['dataset']}, profile {record['profile']}, {machine_of(record)}"
-    sentence = f"Stored result `{name}`: {where} {record['dataset_credit'] or ''}"
-    if table.attrs["stale"]:
-        sentence = f"**Stale: {table.attrs['stale']}; measure it again.** {sentence}"
-    return table, sentence.strip()

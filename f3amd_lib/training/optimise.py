@@ -181,23 +181,6 @@ def advance(task: Task, state: TrainingState, length: int, mesh: Mesh | None = N
     return _laid(jax.lax.scan(one_step, state, None, length=length), mesh, EVERYWHERE)
 
 
-def compile_steps(task: Task, length: int = 1):
-    """Compile `advance` ahead of time, for times and sizes: call what comes back with (task, state).
-
-    Args:
-      task: what to train.
-      length: steps in one program.
-    """
-    return advance.lower(task, jax.eval_shape(initial_state, task), length).compile()
-
-
-def planned_memory(compiled) -> int:
-    """Return the bytes that the compiler plans for a program: what goes in, what comes out, values between."""
-    plan = compiled.memory_analysis()
-    shared = plan.alias_size_in_bytes  # what goes in and comes out in the same place
-    return int(plan.argument_size_in_bytes + plan.output_size_in_bytes + plan.temp_size_in_bytes - shared)
-
-
 @jax.jit
 def _held_out_terms(task: Task, params, statistics, held_out, key) -> dict:
     return task.held_out_terms(params, statistics, held_out, key)

@@ -6,12 +6,13 @@ import pandas as pd
 from f3amd_lib.ground.papers import has_paper_file, load_paper_file, load_paper_table, paper_folders
 from f3amd_lib.ground.profiles import runs_dir
 from f3amd_lib.ground.records import read_table
-from f3amd_lib.ground.stored import committed_table, measured_table
+from f3amd_lib.ground.stored import committed_table
 from f3amd_lib.ground.tables import markdown_table
 from f3amd_lib.measures.registry import METRICS
 from f3amd_lib.papers.printed import SCHEMAS, printed_tables
 
 from f3amd_notebooks.quality_tables import ARROWS
+from f3amd_notebooks.stored_result import measured_table
 
 
 def beside_printed(paper: str, name: str, metrics: Sequence[str]) -> tuple[pd.DataFrame, str]:
