@@ -15,6 +15,7 @@ from pathlib import Path
 
 import jax
 import pandas as pd
+from pages import fill_tables
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this tree's library, whatever is installed
 
@@ -24,10 +25,9 @@ from f3amd_lib.ground.names import counted_cores
 from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.ground.stored import committed_table
-from f3amd_lib.ground.tables import figure_text, fill_tables, markdown_table
+from f3amd_lib.ground.tables import figure_text, markdown_table
 from f3amd_lib.ground.trees import describe, weights_digest
 from f3amd_lib.measures.registry import METRICS, SHOWN, Metric
-from f3amd_lib.networks.presets import find_preset
 from f3amd_lib.papers.printed import SCHEMAS
 from f3amd_lib.text.judge.text_judge import load_judge
 from f3amd_lib.text.stages.text_models import JUDGE, is_latent_preset, load_text_model
@@ -197,16 +197,16 @@ def latent_model_card(path: Path, tables: Mapping[str, pd.DataFrame]) -> str:
       tables: `records/text_pcm*.csv` by name, those that there are.
     """
     trained, wide = load_text_model(path), None
-    rows = [table[table["trained"] == trained.name] for table in tables.values() if "steps" in table]
+    digest = weights_digest(trained.params)
+    rows = [table[table["weights"] == digest] for table in tables.values() if "steps" in table]
+    movement = "What its autoencoder keeps of the movement of real clips was not measured"
     if any(map(len, rows)):
         own = pd.concat(rows).drop_duplicates(["steps", "metric"]).sort_values("steps")
+        if len(kept := own[own["metric"] == "kept_movement"]):
+            share = 100 * kept["value"].iloc[0]
+            movement = f"Its autoencoder keeps {share:.1f} % of the movement of real clips (variance over frames)"
         own["value"] = own["value"].map("{:.3g}".format, na_action="ignore")
         wide = _wide(own, "steps", [*_OF_JUDGE, "sampling_seconds"]).fillna("–")
-    movement = "Its autoencoder was trained as briefly, and vague where that was too short"
-    if "text_pcm3" in tables:
-        kept = tables["text_pcm3"].set_index(["trained", "metric"])["value"]
-        if (share := kept.get((find_preset(trained.name).latent, "kept_movement"))) is not None:
-            movement = f"Its autoencoder keeps {100 * share:.1f} % of the movement of real clips (variance over frames)"
     phases, is_student = trained.training["num_phases"], bool(trained.config.guidance_features)
     what = f"student of {phases} step{'s' * (phases > 1)}" if is_student else "teacher, sampled by DDIM"
     latent = f"{trained.autoencoder.window} x {trained.autoencoder.channels}"

@@ -402,6 +402,9 @@ def latent_rows(bench: Bench, trained: LatentModel | None, row: Mapping, about: 
     made = bench.quality(make)
     if "samples" in bench.settings:
         made = pd.concat([made, bench.variety(make)])
+    if about.get("shipped"):
+        own = reconstructed(bench.real, trained)[2]
+        made = pd.concat([made, own[own["metric"] == "kept_movement"]])
     if not about.get("timed"):
         return made
     taken = {"metric": "sampling_seconds", "value": sentence_seconds(bench, trained, draw)}
@@ -409,13 +412,19 @@ def latent_rows(bench: Bench, trained: LatentModel | None, row: Mapping, about: 
 
 
 def reconstruction_rows(bench: Bench, trained: LatentModel, row: Mapping, about: Mapping, first) -> pd.DataFrame:
-    """Return how well an autoencoder gives held-out motion back: FID, joint and feature error (MotionPCM Table 3).
+    """Return how well an autoencoder gives held-out motion back: FID, and what `reconstructed` says."""
+    motions, given_back, own = reconstructed(bench.real, trained)
+    return pd.concat([bench.quality(lambda *asked: given_back if bench.vectors else motions), own])
+
+
+def reconstructed(real: TextMotions, trained: LatentModel) -> tuple[list, list, pd.DataFrame]:
+    """Return motions as an autoencoder gives them back, positions and vectors, and its errors (MotionPCM Table 3).
 
     Joints are compared after the roots of each frame were laid on each other. The feature error is the norm of a clip's
     difference in network units, summed over clips, divided by their frames (MotionLCM V2's code). Kept movement (ours)
     is the variance over a clip's frames, over that of the real clip: a pose that only glides along has nearly none.
     """
-    real, most = bench.real, int(bench.real.lengths.max())
+    most = int(real.lengths.max())
     vectors = real.redundant_vectors(released=trained.autoencoder.released_facing)
     clips = [vectors[first:last] for first, last in zip(real.start[:-1], real.start[1:], strict=True)]
     motions, given_back, apart, moved = [], [], [], []
@@ -437,7 +446,7 @@ def reconstruction_rows(bench: Bench, trained: LatentModel, row: Mapping, about:
         {"metric": "feature_error", "value": float(np.sum(apart) / real.lengths.sum())},
         {"metric": "kept_movement", "value": float(np.divide(*np.sum(moved, axis=0)))},
     ])  # fmt: skip
-    return pd.concat([bench.quality(lambda *asked: given_back if bench.vectors else motions), own])
+    return motions, given_back, own
 
 
 # ----------------------------------------------------------------------------------------------------------- the runner
@@ -540,6 +549,8 @@ def measure_text_table(
         base = text_models.preset_and_branch(preset)[0]
         form, latent = presets.find_preset(base), text_models.is_latent_preset(base)
         if latent and not plan:  # these see clips of a length of their own
+            if about.get("shipped") and (found := text_models.shipped_for(preset, data, encoder, LatentModel)):
+                return found
             return train_stage(data, encoder, profile, preset, folder=folder, **leg)
         # Prefixes and blocks have lengths of their own; other windows only say how long the longest clip is.
         own = "prefix_frames" in form.training or "block_frames" in form.network

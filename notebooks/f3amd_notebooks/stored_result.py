@@ -1,4 +1,4 @@
-"""What earlier runs left, as a notebook shows it: a table, and how long each notebook ran."""
+"""What earlier runs left, as a notebook shows it: tables, a picture, and how long each notebook ran."""
 
 from pathlib import Path
 
@@ -7,6 +7,7 @@ from f3amd_lib.ground.profiles import repository_root
 from f3amd_lib.ground.records import read_table
 from f3amd_lib.ground.stored import committed_table, machine_of
 from f3amd_lib.ground.tables import markdown_table
+from IPython.display import Image
 
 
 def stored_result(dataset: str, name: str) -> str:
@@ -16,6 +17,50 @@ def stored_result(dataset: str, name: str) -> str:
     frame, record = found
     where = f"profile {record['profile']}, data {record['dataset']}, {machine_of(record)}"
     return f"Stored result: `{name}`, {where}\n\n{markdown_table(frame, digits=2)}"
+
+
+def measured_table(dataset: str, name: str, measurement: str) -> tuple[pd.DataFrame | None, str]:
+    """Read the committed table of a data set, else that of Bandai, and say where it comes from.
+
+    Args:
+      dataset: a name of `profiles.DATASETS`.
+      name: of the table, without ending.
+      measurement: of `measure.MEASUREMENTS`, which writes it.
+
+    Returns:
+      (table or None, a sentence: data, profile, machine, date and credit, or how to measure it).
+      `table.attrs["dataset"]` names the data set that was measured.
+    """
+    found = committed_table(dataset, name) or committed_table("bandai", name)
+    if found is None:
+        return None, f"Not measured yet: `{name}`. `make measure MEASURE={measurement} DATA=bandai` measures it."
+    table, record = found
+    table.attrs["dataset"] = record["dataset"]
+    where = f"data {record['dataset']}, profile {record['profile']}, {machine_of(record)}"
+    sentence = f"Stored result `{name}`: {where} {record['dataset_credit'] or ''}"
+    if table.attrs["stale"]:
+        sentence = f"**Stale: {table.attrs['stale']}; measure it again.** {sentence}"
+    return table, sentence.strip()
+
+
+_SEEN = {
+    "joint_acceleration": "joint acceleration, cm/frame²", "bones_off": "bones off, %",
+    "moved": "moved by the fit, cm", "slide": "slide, cm/s", "slide_held": "with feet held, cm/s",
+}  # fmt: skip
+
+
+def caption_strip() -> tuple[Image | str, str]:
+    """Return the picture of twelve captions, real and made, and the means of what was measured there as Markdown.
+
+    `scripts/caption_strip.py` leaves both; where they are missing, the first says so.
+    """
+    if (found := committed_table("bandai", "captions")) is None:
+        return "Not measured yet: `python scripts/caption_strip.py` draws twelve captions.", ""
+    table, record = found
+    means = table.groupby("system", sort=False)[list(_SEEN)].mean().rename(columns=_SEEN).reset_index()
+    picture = repository_root() / "paper_figures/bandai/laptop/media/captions.png"
+    about = f"*Means of twelve captions; {machine_of(record)} {record['dataset_credit']}*"
+    return Image(filename=picture), f"{markdown_table(means, digits=1)}\n\n{about}"
 
 
 def running_times(*, root=None) -> pd.DataFrame:
