@@ -77,20 +77,9 @@ def stiff_walk(step: float, num_frames: int = 60) -> Motion:
 def walks_and_runs() -> PackedMotion:
     """Calm walks 1.2 m/s and has a run in the test split; of proud only fast test clips exist."""
     train, validation, test = 0, 1, 2
-    made = packed_from(
-        [
-            (stiff_walk(0.04), 0, train),
-            (stiff_walk(0.04), 0, train),
-            (stiff_walk(0.12), 0, train),
-            (stiff_walk(0.03), 1, train),
-            (stiff_walk(0.042), 0, test),
-            (stiff_walk(0.12), 0, test),
-            (stiff_walk(0.09), 1, test),
-            (stiff_walk(0.15), 1, test),
-            (stiff_walk(0.04, 9), 0, test),
-            (stiff_walk(0.045), 0, validation),
-        ]
-    )
+    clips = [(stiff_walk(step), style, train) for step, style in ((0.04, 0), (0.04, 0), (0.12, 0), (0.03, 1))]
+    clips += [(stiff_walk(step), style, test) for step, style in ((0.042, 0), (0.12, 0), (0.09, 1), (0.15, 1))]
+    made = packed_from([*clips, (stiff_walk(0.04, 9), 0, test), (stiff_walk(0.045), 0, validation)])
     made.floor_shift[:] = np.linspace(0.01, 0.10, 10)
     return made
 
@@ -137,16 +126,9 @@ def walks_of(styles, splits=(0, 0, 1, 2, 2), seconds: float = 4.0) -> PackedMoti
 
 def tiny_packed(mirror_styles=("calm",)) -> PackedMotion:
     """Five clips of two styles: three for training, one each to validate and to test."""
-    return packed_from(
-        [
-            (wandering_motion(30, 0), 0, 0),
-            (wandering_motion(21, 1), 1, 0),
-            (wandering_motion(26, 2), 0, 1),
-            (wandering_motion(17, 3), 1, 0),
-            (wandering_motion(24, 4), 1, 2),
-        ],
-        mirror_styles=mirror_styles,
-    )
+    frames_styles_splits = enumerate(((30, 0, 0), (21, 1, 0), (26, 0, 1), (17, 1, 0), (24, 1, 2)))
+    clips = [(wandering_motion(frames, seed), style, split) for seed, (frames, style, split) in frames_styles_splits]
+    return packed_from(clips, mirror_styles=mirror_styles)
 
 
 _TINY = {"channels": CHANNELS, "num_styles": 2, "window": WINDOW, "num_history": HISTORY, "latent_width": 8, "depth": 1}

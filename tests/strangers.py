@@ -103,17 +103,12 @@ def bvh_cases() -> dict[str, bytes]:
     cases = {"plain": plain}
     cases |= {f"names: {tool}": format_bvh(walker(names)) for tool, names in NAMINGS.items()}
     cases |= {f"order {order}": reordered(plain, motion, order) for order in ("XYZ", "XZY", "YXZ", "YZX", "ZYX")}
-    cases |= {
-        "CR LF": plain.replace("\n", "\r\n"),
-        "CR CR LF": plain.replace("\n", "\r\r\n"),
-        "CR": plain.replace("\n", "\r"),
-    }
-    cases["exponents"] = head + "\n".join(
-        lines[:3] + [" ".join(f"{float(x):.7e}" for x in row.split()) for row in numbers]
-    )
-    cases["wrapped rows"] = head + "\n".join(
-        lines[:3] + [" ".join(part) for row in map(str.split, numbers) for part in (row[:30], row[30:])]
-    )
+    ends = {"CR LF": "\r\n", "CR CR LF": "\r\r\n", "CR": "\r"}
+    cases |= {name: plain.replace("\n", end) for name, end in ends.items()}
+    exponents = [" ".join(f"{float(x):.7e}" for x in row.split()) for row in numbers]
+    wrapped = [" ".join(part) for row in map(str.split, numbers) for part in (row[:30], row[30:])]
+    cases["exponents"] = head + "\n".join(lines[:3] + exponents)
+    cases["wrapped rows"] = head + "\n".join(lines[:3] + wrapped)
     cases["no End Site"] = re.sub(r"End Site\s*\{[^}]*\}", "", plain)
     cases["offset at the root"] = re.sub(r"(?<=ROOT Hips\n\{\n\tOFFSET )[^\n]*", "0.0 92.0 0.0", plain)
     cases["comment first"] = "# made by X\n" + plain
@@ -144,9 +139,8 @@ def bvh_cases() -> dict[str, bytes]:
 
     cases["six channels"] = six + with_positions(0.0)
     cases["six channels of zero"] = six + with_positions(0.0, share=0.0)
-    cases["six channels, no OFFSET"] = re.sub(r"(JOINT \S+\s*\{\s*OFFSET )[^\n]*", r"\g<1>0 0 0", six) + with_positions(
-        0.0
-    )
+    no_offset = re.sub(r"(JOINT \S+\s*\{\s*OFFSET )[^\n]*", r"\g<1>0 0 0", six)
+    cases["six channels, no OFFSET"] = no_offset + with_positions(0.0)
     cases["six channels, stretched"] = six + with_positions(1.0)
     # What is no walk of this skeleton any more, or no file at all.
     cases["decimal commas"] = plain.replace(".", ",")

@@ -66,7 +66,9 @@ def test_rows_have_the_ledgers_columns_steps_arrive_and_real_motion_is_real(tabl
     assert first["Real", "text_FID"] == pytest.approx(0.0, abs=1e-6)
     assert first["MotionPCM-M2", "text_FID"] > 1e-3
     assert first["MotionPCM-M2", "sampling_seconds"] > 0.0 and ("Real", "sampling_seconds") not in first
-    one, three = (tables["text_pcm4"].query(f"steps == {steps}")["value"].to_numpy() for steps in (1, 3))
+    kept = tables["text_pcm4"]["metric"] == "kept_movement"
+    assert tables["text_pcm4"][kept]["value"].between(0, 1).all() and kept.sum() == 2
+    one, three = (tables["text_pcm4"][~kept].query(f"steps == {steps}")["value"].to_numpy() for steps in (1, 3))
     assert not np.array_equal(one, three)
     none, usual = (part["value"].to_numpy() for _, part in tables["text_guidance"].groupby("guidance"))
     assert np.array_equal(usual, three) and not np.array_equal(none, three)

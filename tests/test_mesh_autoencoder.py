@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from builders import SKELETON, wandering_motion
+from builders import SKELETON, refused, wandering_motion
 from compiled import Compiled
 from flax import nnx
 
@@ -68,9 +68,8 @@ def test_elu_follows_convolutions_alone_and_not_the_decoders_last(linear):
 
     def convolved(layer, x, near):
         bases = np.asarray(layer.bases[...]).reshape(CONFIG.num_bases, x.shape[1], -1)
-        return np.einsum("vbk,vkc,bcd->vd", np.asarray(layer.coefficients[...]), x[near], bases) + np.asarray(
-            layer.bias[...]
-        )
+        coefficients, bias = np.asarray(layer.coefficients[...]), np.asarray(layer.bias[...])
+        return np.einsum("vbk,vkc,bcd->vd", coefficients, x[near], bases) + bias
 
     def pooled(layer, x, near):
         weights = np.abs(np.asarray(layer.weights[...]))
@@ -93,9 +92,7 @@ def test_what_makes_no_sense_is_refused():
         ({"channels": (6,)}, "channels must be as many numbers"),
         ({"around": (5, 0)}, "each of around must be above 0"),
     ):
-        with pytest.raises(ValueError, match=words):
-            MeshAutoencoderConfig(num_vertices=252, **(SIZES | changes))
+        refused(words, MeshAutoencoderConfig, num_vertices=252, **SIZES | changes)
     network = MeshAutoencoder(CONFIG, rngs=nnx.Rngs(0))
-    with pytest.raises(ValueError, match=r"vertices must be \[N, 252, 3\]"):
-        network.encode(VERTICES[:, 1:], MESH.lists)
+    refused(r"vertices must be \[N, 252, 3\]", network.encode, VERTICES[:, 1:], MESH.lists)
     assert MeshAutoencoderConfig.from_dict(CONFIG.to_dict()) == CONFIG

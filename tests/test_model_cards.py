@@ -111,9 +111,3 @@ def test_limits_follow_from_the_figures(figure, says):
     good = {"x0_error_ratio": 0.2, "stepping_rate": 1.9, "slide_speed": 6.0, "style_coverage": 97.6}
     assert says in model_cards.model_card(path, quality(weights, **good | figure))
     assert says.split(":")[0] not in model_cards.model_card(path, quality(weights, **good))
-
-
-def test_shipped_weights_stay_within_their_megabytes():
-    assert sum(path.stat().st_size for path in WALKERS) <= 20_000_000
-    assert sum(path.stat().st_size for path in TEXT) <= 8_000_000
-    assert JUDGE.stat().st_size <= 3_000_000

@@ -23,7 +23,6 @@ COURSE = sorted((ROOT / "notebooks/course").glob("*.ipynb"))
 STANDALONE = sorted((ROOT / "notebooks/standalone").glob("*.ipynb"))
 PATH = ROOT / "notebooks/00_beside_the_paper.ipynb"  # has the number of the reading guide, and writes nothing
 LARGEST_NOTEBOOK, LARGEST_PATH, MOVING = 250_000, 1_500_000, 160_000  # bytes; one moving picture comes on top
-LONGEST_SETUP = 12  # lines of code of the cell that calls use_style()
 LARGEST_FILE = 5_000_000  # bytes
 ALL_WEIGHTS = 28_000_000  # bytes of f3amd_lib/pretrained/ together
 
@@ -98,9 +97,6 @@ def parameter_faults(code_cells) -> list[str]:
         return [f"{len(tagged)} cells are tagged parameters"]
     values = {}
     faults = []
-    setup = next((cell.source for cell in code_cells if "use_style()" in cell.source), "")
-    if (lines := len([line for line in setup.splitlines() if line.strip() and line[0] != "#"])) > LONGEST_SETUP:
-        faults.append(f"{lines} lines of code before the story begins, limit {LONGEST_SETUP}")
     for statement in ast.parse(tagged[0].source).body:
         try:
             (target,) = statement.targets
@@ -121,12 +117,8 @@ def tags_of(cell) -> list[str]:
 
 def tracked_files() -> list[Path]:
     """Files that git tracks, or would if everything were added."""
-    listing = subprocess.run(
-        ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-    )
+    words = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+    listing = subprocess.run(words, cwd=ROOT, capture_output=True, text=True)
     if listing.returncode:
         pytest.skip("not a git checkout: nothing says which files belong to it")
     paths = [ROOT / name for name in listing.stdout.split("\0") if name]
@@ -162,12 +154,6 @@ def test_notebook_is_fit_to_be_read(path):
     if path in COURSE:
         assert re.fullmatch(r"\d\d_[a-z0-9_]+\.ipynb", path.name)
         assert not re.search(r"keep_figure|write_table", path.read_text(encoding="utf-8")), "the course stores nothing"
-
-
-def test_notebooks_are_numbered_without_gaps():
-    assert NOTEBOOKS, "there are no notebooks"
-    assert NOTEBOOKS[0] == PATH, "JupyterLab and the site show another notebook first"
-    assert [path.name[:2] for path in NOTEBOOKS[1:]] == [f"{i:02d}" for i in range(len(NOTEBOOKS) - 1)]
 
 
 def written_names(path: Path) -> list[re.Pattern]:
@@ -286,13 +272,11 @@ ELSEWHERE = "/" + "home/somebody/motion.bvh"
     "spoil, fault",
     [
         (set_verdict(execution_count=None), "execution counts"),
-        (set_verdict(execution_count=3), "execution counts"),
         (set_verdict(outputs=[ERROR_OUTPUT]), "error output"),
         (set_verdict(outputs=[]), "has no output to check"),
         (set_verdict(metadata={}), "no cell is tagged nbval-check-output"),
         (set_verdict(source=f"open('{ELSEWHERE}')"), "absolute path"),
         (set_verdict(source="x" * LARGEST_NOTEBOOK), "limit 250000"),
-        (set_verdict(source="import numpy as np\n" * 12 + "use_style()"), "13 lines of code before the story"),
         (set_verdict(metadata={"tags": ["hide-input", "nbval-check-output"]}), "folded on the site or in JupyterLab"),
         (set_verdict(source="  "), "empty code cell"),
         (set_verdict(source="keep_figure(figure, results, 'name')\ntable"), "drawn and not shown: keep_figure(figure"),
@@ -303,11 +287,8 @@ ELSEWHERE = "/" + "home/somebody/motion.bvh"
         (lambda notebook: notebook["metadata"]["kernelspec"].update(name="my-env"), "kernel is not python3"),
         (set_parameters('profile = "laptop"\ndata = "synthetic"'), "profile is not 'smoke'"),
         (set_parameters('profile = "smoke"\ndata = "bandai"'), "data is not 'synthetic'"),
-        (
-            set_parameters('profile = "smoke"\ndata = "synthetic"\nrounds = 2 * 40'),
-            "more than literals: 'rounds = 2 * 40'",
-        ),
-        (set_parameters('import os\nprofile = "smoke"\ndata = "synthetic"'), "more than literals: 'import os'"),
+        (set_parameters("rounds = 2 * 40"), "more than literals: 'rounds = 2 * 40'"),
+        (set_parameters("import os"), "more than literals: 'import os'"),
         (lambda notebook: notebook["cells"][0]["metadata"].update(tags=[]), "0 cells are tagged parameters"),
     ],
 )
@@ -315,17 +296,6 @@ def test_each_fault_of_a_notebook_is_found(tmp_path, spoil, fault):
     notebook = good_notebook()
     spoil(notebook)
     assert any(fault in found for found in notebook_faults(save(tmp_path, notebook)))
-
-
-def test_a_standalone_notebook_needs_no_number_and_no_parameters(tmp_path):
-    notebook = good_notebook()
-    set_parameters("import numpy")(notebook)
-    notebook["cells"][0]["metadata"].update(tags=[])
-    path = save(tmp_path, notebook, "anything.ipynb")
-    assert notebook_faults(path, numbered=False) == []
-    set_verdict(execution_count=3)(notebook)
-    (fault,) = notebook_faults(save(tmp_path, notebook, "anything.ipynb"), numbered=False)
-    assert "execution counts" in fault
 
 
 @pytest.mark.parametrize(

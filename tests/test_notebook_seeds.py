@@ -21,13 +21,8 @@ PICTURES = shutil.ignore_patterns("*.png", "*.gif", "__pycache__", ".ipynb_check
 def copy(tmp_path_factory) -> Path:
     """A repository with library, notebooks and stored results, and no runs."""
     folder = tmp_path_factory.mktemp("repository")
-    for name in (
-        "f3amd_lib",
-        "f3amd_companion",
-        "notebooks",
-        "paper_figures",
-        "tests",
-    ):  # 00 counts the tests of each equation
+    # 00 counts the tests of each equation.
+    for name in ("f3amd_lib", "f3amd_companion", "notebooks", "paper_figures", "tests"):
         shutil.copytree(ROOT / name, folder / name, ignore=PICTURES)
     shutil.copy(ROOT / "pyproject.toml", folder)
     return folder

@@ -40,10 +40,8 @@ def whole_walks(program, trained, num_steps, batch):
     noise, _, *given = onnx_export.seeded_inputs(trained.config, batch).values()
     run, condition = onnx_export.OnnxProgram(program), Condition(*given)
     sigmas, key = schedule.grid(num_steps), jax.random.key(7)
-    if schedule.sampler == "ddpm":  # draws at each step: the same keys, and then the same start
-        key_steps = jax.random.split(key)[1]
-    else:
-        key_steps = None
+    # DDPM draws at each step: the same keys, and then the same start.
+    key_steps = jax.random.split(key)[1] if schedule.sampler == "ddpm" else None
 
     def denoise(x_noisy, sigma):
         return run(x_noisy=x_noisy, sigma=np.full(batch, sigma), **condition._asdict())
@@ -75,9 +73,8 @@ def test_other_weights_or_another_condition_would_be_seen(folder, trained):
 @needs_onnx
 def test_the_worked_example_runs_beside_the_files_alone(folder):
     bare = {"PATH": os.environ["PATH"]}
-    done = subprocess.run(
-        [sys.executable, "-I", "example.py"], cwd=folder, env=bare, capture_output=True, text=True, check=False
-    )
+    words = [sys.executable, "-I", "example.py"]
+    done = subprocess.run(words, cwd=folder, env=bare, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "2 characters, 8 frames" in done.stdout
 

@@ -35,21 +35,12 @@ def weights_of(network):
 
 
 def acmdm(**changes) -> TextModel:
-    config = ACMDMConfig(
-        **{"num_joints": 5, "channels": 3, "window": 8, "latent_width": 16, "depth": 2, "num_heads": 2, "text_width": 8}
-        | changes
-    )
+    sizes = {"num_joints": 5, "channels": 3, "window": 8, "latent_width": 16, "depth": 2, "num_heads": 2}
+    config = ACMDMConfig(**sizes | {"text_width": 8} | changes)
     axes = AxisNormaliser(np.arange(3, dtype=np.float32), np.full(3, 2.0, np.float32))
     params = weights_of(ACMDM(config, rngs=nnx.Rngs(0)))
-    return TextModel(
-        name="tiny-ACMDM",
-        codec=MotionCodec(axes),
-        record=RECORD,
-        config=config,
-        params=params,
-        schedule=straight(),
-        **ABOUT,
-    )
+    model = {"name": "tiny-ACMDM", "codec": MotionCodec(axes), "record": RECORD, "schedule": straight()}
+    return TextModel(config=config, params=params, **model, **ABOUT)
 
 
 def motionpcm(guidance_features: int) -> LatentModel:
@@ -106,16 +97,12 @@ def by_jax(trained, inputs, count: int) -> np.ndarray:
     """The same by the library's own samplers."""
     network, text = network_with(trained.config, trained.params), inputs["text"]
     if isinstance(trained, TextModel):
-        predict = text_prediction(network, TextCondition(text, inputs["mask"] > 0.5))
-        return solve(
-            predict, trained.config.objective, trained.schedule, inputs["state"], sampler="ddim", num_steps=count
-        )
-    how = {"num_steps": count}
+        predict, how = text_prediction(network, TextCondition(text, inputs["mask"] > 0.5)), {"sampler": "ddim"}
+        return solve(predict, trained.config.objective, trained.schedule, inputs["state"], num_steps=count, **how)
+    asked, how = (network, trained.schedule, text), {"num_steps": count}
     if trained.config.guidance_features:
-        return sample_student(
-            network, trained.schedule, text, inputs["state"], skip=50, guidance=inputs["guidance"], **how
-        )
-    return sample_teacher(network, trained.schedule, text, np.zeros(8), inputs["state"], guidance=0.0, **how)
+        return sample_student(*asked, inputs["state"], skip=50, guidance=inputs["guidance"], **how)
+    return sample_teacher(*asked, np.zeros(8), inputs["state"], guidance=0.0, **how)
 
 
 @needs_onnx

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from builders import refused
+from test_skeleton import legs
 
 from f3amd_lib.data import packed as packed_module
 from f3amd_lib.data.packed import PackedMotion, cache_path, load_packed, pack, packed_dataset, save_packed
@@ -13,12 +14,7 @@ from f3amd_lib.ground.trees import describe
 from f3amd_lib.motion.rotations import matrix_from_euler
 from f3amd_lib.motion.skeleton import Motion, Skeleton
 
-LEGS = Skeleton(
-    names=("Hips", "LeftHip", "LeftToe", "RightHip", "RightToe"),
-    parents=(-1, 0, 1, 0, 3),
-    offsets=np.array([[0, 0, 0], [0.1, 0, 0], [0, -0.88, 0], [-0.1, 0, 0], [0, -0.88, 0]]),
-    end_sites=((2, (0.0, 0.0, 0.1)),),
-)
+LEGS = legs(end_sites=((2, (0.0, 0.0, 0.1)),))
 
 
 def legs_motion(frames: int, seed: int, skeleton: Skeleton = LEGS) -> Motion:
@@ -42,12 +38,8 @@ def make_dataset(motions: dict[str, Motion], fingerprint: str = "ab" * 32) -> Da
 
 @pytest.fixture
 def motions() -> dict[str, Motion]:
-    return {
-        "sad_1": legs_motion(42, 0),
-        "happy_1": legs_motion(60, 1),
-        "sad_2": legs_motion(41, 2),
-        "sad_é": legs_motion(50, 3),
-    }
+    frames = {"sad_1": 42, "happy_1": 60, "sad_2": 41, "sad_é": 50}
+    return {name: legs_motion(count, seed) for seed, (name, count) in enumerate(frames.items())}
 
 
 @pytest.fixture
@@ -154,12 +146,8 @@ def test_a_damaged_cache_is_packed_anew(motions, cache_dir):
 def test_real_bandai_packs_small(bandai_dataset, tmp_path):
     packed = pack(bandai_dataset, progress=False)
     assert (packed.num_clips, packed.num_frames) == (1063, 167_423 - 20 - 24 - 31 - 31)
-    assert [name for name, _ in packed.skipped] == [
-        "dataset-1_dash_normal_001",
-        "dataset-1_run_normal_001",
-        "dataset-1_walk-back_normal_001",
-        "dataset-1_walk_normal_002",
-    ]
+    skipped = ("dash_normal_001", "run_normal_001", "walk-back_normal_001", "walk_normal_002")
+    assert [name for name, _ in packed.skipped] == [f"dataset-1_{name}" for name in skipped]
     path = save_packed(tmp_path / "bandai.safetensors", packed)
     assert path.stat().st_size < 50_000_000
     again = load_packed(path)

@@ -54,15 +54,7 @@ def test_real_motion_tells_whether_data_and_evaluator_are_right(caplog):
 
 # ------------------------------------------------------------------------------------------ the rehearsal
 
-WORDS = {
-    "a": "DET",
-    "person": "NOUN",
-    "walks": "VERB",
-    "turns": "VERB",
-    "slowly": "ADV",
-    "left": "ADV",
-    "jumps": "VERB",
-}
+WORDS = dict(a="DET", person="NOUN", walks="VERB", turns="VERB", slowly="ADV", left="ADV", jumps="VERB")
 
 
 @pytest.fixture(scope="module")

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from builders import refused
 
 from f3amd_lib.diffusion.oracles import GaussianMixture
 from f3amd_lib.diffusion.schedules import variance_preserving_betas
@@ -29,10 +30,7 @@ def normal(seed, *shape):
     return jax.random.normal(jax.random.key(seed), shape)
 
 
-def test_alpha_bars_are_the_published_schedules():
-    alpha_bar = SCHEDULE.alpha_bars[[0, 99, 199, 299, 399, 499, 599, 699, 799, 899, 999]]
-    wanted = "999150 895463 755238 592183 426086 277670 161753 083128 037195 014299 004660".split()
-    np.testing.assert_allclose(alpha_bar, [float(f"0.{digits}") for digits in wanted], atol=5e-7)
+def test_shares_are_those_of_the_published_schedule():
     alpha, sigma = shares(SCHEDULE, np.array([0, 499, 999]), np)
     np.testing.assert_allclose(alpha, [0.99957, 0.52694, 0.06826], atol=6e-6)
     np.testing.assert_allclose(sigma, [0.02915, 0.84990, 0.99767], atol=6e-6)
@@ -62,8 +60,7 @@ def test_phases_end_where_they_should(skip, ends):
 
 def test_a_cut_that_makes_no_sense_is_refused():
     for skip, num_phases in ((30, 1), (100, 11), (100, 0), (0, 1)):
-        with pytest.raises(ValueError, match="phases need a skip that divides"):
-            cut_phases(1000, skip, num_phases)
+        refused("phases need a skip that divides", cut_phases, 1000, skip, num_phases)
 
 
 # ----------------------------------------------------------------------------------------------------------------- jump
@@ -165,10 +162,8 @@ def test_a_teachers_times_by_both_spacings():
     fifty = ddim_times(1000, 50, "leading")
     assert fifty[:2].tolist() == [981, 961] and fifty[-2:].tolist() == [1, 0]
     assert ddim_times(1000, 1, "leading").tolist() == [1, 0] and ddim_times(1000, 2, "leading").tolist() == [501, 1, 0]
-    with pytest.raises(ValueError, match="did you mean 'leading'"):
-        ddim_times(1000, 5, "leadin")
-    with pytest.raises(ValueError, match="1 to 1000 steps"):
-        ddim_times(1000, 0)
+    refused("did you mean 'leading'", ddim_times, 1000, 5, "leadin")
+    refused("1 to 1000 steps", ddim_times, 1000, 0)
 
 
 MIXTURE = GaussianMixture([-1.0, 0.5], 0.2, [0.3, 0.7])

@@ -1,6 +1,7 @@
 """The motion player's page: its numbers, its text, what it refuses. tests/web opens it."""
 
 import base64
+import hashlib
 import json
 import re
 import subprocess
@@ -167,16 +168,10 @@ def test_the_pages_own_body_has_the_vertices_of_pythons(tmp_path):
     assert ours == theirs
 
 
-def pole_of_three() -> Motion:
-    """A rig of which nobody knows where its toes or hips are."""
-    parents = (-1, 0, 1)
-    chain = Skeleton(("Root", "Mid", "Tip"), parents, [[0, 0, 0], [0, 1, 0], [0, 1, 0]])
-    rotations = np.broadcast_to(np.eye(3), (FRAMES, 3, 3, 3))
-    return Motion(chain, np.full((FRAMES, 3), 0.25), rotations, name="pole")
-
-
 def test_unlike_skeletons_share_a_page():
-    pole = pole_of_three()
+    # A rig of which nobody knows where its toes or hips are.
+    chain = Skeleton(("Root", "Mid", "Tip"), (-1, 0, 1), [[0, 0, 0], [0, 1, 0], [0, 1, 0]])
+    pole = Motion(chain, np.full((FRAMES, 3), 0.25), np.tile(np.eye(3), (FRAMES, 3, 1, 1)), name="pole")
     data = page_data(player_page([wandering_motion(FRAMES), pole, pole]))
     assert [scene["characters"][0]["skeleton"] for scene in data["scenes"]] == [0, 1, 1]
     tracks = read_tracks(data)[1][0]
@@ -272,12 +267,8 @@ def test_a_film_strip_stands_beside_the_page(tmp_path):
 
 
 def test_three_is_the_bundle_that_was_checked():
-    import hashlib
-
     wanted, name = (FOLDER / "three.sha256").read_text().split()
     assert hashlib.sha256((FOLDER / name).read_bytes()).hexdigest() == wanted
-    licence = (FOLDER / name).read_text(encoding="utf-8")[:1500]
-    assert "The MIT License" in licence and "three.js authors" in licence
 
 
 def test_a_ghost_is_a_character_that_can_be_seen_through():

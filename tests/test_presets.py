@@ -9,7 +9,7 @@ import jax
 import numpy as np
 import pandas as pd
 import pytest
-from builders import CHANNELS, SKELETON, packed_from, wandering_motion
+from builders import CHANNELS, SKELETON, packed_from, refused, wandering_motion
 
 from f3amd_lib.data.windows import build_windows, fit_normaliser
 from f3amd_lib.diffusion.schedules import variance_preserving_linear
@@ -121,8 +121,7 @@ def test_another_paper_brings_a_file_of_its_own(tmp_path):
 def test_a_preset_that_makes_no_sense_is_refused_by_file_and_name(tmp_path, wrong, message):
     path = tmp_path / "presets.toml"
     path.write_text(ANOTHER_PAPER + f'[presets.Wrong]\nsource = "ours"\n{wrong}\n')
-    with pytest.raises(ValueError, match=f"presets.toml: presets.Wrong: .*{message}"):
-        presets.read_presets(path)
+    refused(f"presets.toml: presets.Wrong: .*{message}", presets.read_presets, path)
 
 
 def test_configs_of_every_family_survive_json():
@@ -130,8 +129,7 @@ def test_configs_of_every_family_survive_json():
         config = presets.build_config(name, **SIZE)
         assert presets.config_from_dict(json.loads(json.dumps(config.to_dict()))) == config
     values = presets.build_config("CAMDM", **SIZE).to_dict()
-    with pytest.raises(ValueError, match="unknown model family 'CAMD'; did you mean 'CAMDM'"):
-        presets.config_from_dict({**values, "family": "CAMD"})
+    refused("unknown model family 'CAMD'; did you mean 'CAMDM'", presets.config_from_dict, {**values, "family": "CAMD"})
 
 
 @functools.cache

@@ -7,7 +7,6 @@ import types
 import pytest
 from builders import refused
 
-from f3amd_lib.data import sources
 from f3amd_lib.ground import profiles
 from f3amd_lib.ground.profiles import load_profile, results_dir, runs_dir
 from f3amd_lib.networks import presets
@@ -22,10 +21,6 @@ def test_every_pair_gives_a_profile_of_a_known_network(name, dataset):
     values = dataclasses.asdict(profile)
     del values["name"], values["dataset"]
     assert load_profile(name, dataset, **values) == profile
-
-
-def test_data_sets_are_those_that_can_be_opened():
-    assert profiles.DATASETS == sources.NAMES
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """The protocol: what is measured on what, with intervals, in tidy rows."""
 
 import dataclasses
+import functools
 import types
 
 import jax
@@ -69,19 +70,8 @@ def measured(generator, packed, prepared, classifier):
 
 TEXT_TABLES = ("text", "control", "reconstruction")
 TEXT_METRICS = {metric.name for table in TEXT_TABLES for metric in SHOWN[table]} | {"sampling_seconds", "LSD"}
-PROTOCOL_METRICS = (
-    set(METRICS)
-    - TEXT_METRICS
-    - {
-        "stepping_rate",
-        "slide_speed",
-        "sliding_share",
-        "floor_penetration",
-        "seam_kick",
-        "foot_all_frames",
-        "acceleration_ratio",
-    }
-)
+WALKING_METRICS = {"stepping_rate", "slide_speed", "sliding_share", "floor_penetration", "seam_kick"}
+PROTOCOL_METRICS = set(METRICS) - TEXT_METRICS - WALKING_METRICS - {"foot_all_frames", "acceleration_ratio"}
 """All but what `measure walking` and the queues of readings and of text measure."""
 
 
@@ -226,13 +216,8 @@ def test_the_same_paths_turn_alike_at_the_pace_of_each_style(packed):
 
 
 def test_seeds_become_means_with_intervals():
-    rows = pd.DataFrame(
-        [
-            {"model": "A", "window_frames": 32, "steps": 8, "varies": "seed", "seed": seed,
-             "metric": "FID", "unit": "", "better": "down", "value": value}
-            for seed, value in enumerate((1.0, 2.0, 3.0))
-        ]
-    )  # fmt: skip
+    rows = pd.DataFrame({"seed": [0, 1, 2], "value": [1.0, 2.0, 3.0]})
+    rows = rows.assign(model="A", window_frames=32, steps=8, varies="seed", metric="FID", unit="", better="down")
     (row,) = module.summarise(rows).to_dict("records")
     assert (row["value"], row["repeats"]) == (2.0, 3)
     # Student's t with 2 degrees of freedom: 4.303 * 1 / sqrt(3).
@@ -260,13 +245,10 @@ def test_too_few_windows_and_unknown_styles_are_refused(packed, classifier):
     many = dataclasses.replace(SMALL, windows_per_style=1000)
     refused("1000 are needed", module.measure_real, packed, classifier, many, window=32)
     # One rollout of 96 frames holds 4 windows of 20; half the held-out clips hold 6.
-    assert module.windows_that_fit(packed, classifier, many, window=32) == 4
+    fitting = functools.partial(module.windows_that_fit, packed, classifier, window=32)
+    assert fitting(many) == 4 and fitting(dataclasses.replace(many, num_frames=960)) == 6
     short = dataclasses.replace(many, num_frames=19)
-    refused(
-        "no window of 20 frames .* make longer rollouts", module.windows_that_fit, packed, classifier, short, window=32
-    )
-    longer = dataclasses.replace(many, num_frames=960)
-    assert module.windows_that_fit(packed, classifier, longer, window=32) == 6
+    refused("no window of 20 frames .* make longer rollouts", fitting, short)
     unknown = dataclasses.replace(SMALL, styles=("Zombi",))
     refused("'?Zombi'?", module.measure_real, packed, classifier, unknown, window=32)
 

@@ -149,6 +149,3 @@ def test_what_is_no_release_is_refused(tmp_path):
     small = released(joints=3, styles=5, width=16, depth=1, hidden=32)
     lacking = {name: array for name, array in small.items() if not name.endswith("norm1.bias")}
     refused("has no array 'seqEncoder.layers.0.norm1.bias'", camdm, lacking, tmp_path)
-    misshapen = small | {"output_process.poseFinal.weight": np.zeros((7, 16), np.float32)}
-    refused("output_process.poseFinal.weight must have the shape", camdm, misshapen, tmp_path)
-    refused("has an array 'x.weight' that", camdm, small | {"x.weight": np.zeros(7, np.float32)}, tmp_path)

@@ -5,9 +5,6 @@ import pytest
 from builders import refused
 from f3amd_notebooks.quality_tables import BAR_MODELS, quality_bars
 
-from f3amd_companion.measuring.measure import ONE_STEP_MODELS
-from f3amd_lib.ground.profiles import load_profile
-
 REAL = {
     "style_coverage": 99.0, "FID": 10.0, "EMD": 5.0, "IRD": 4.0, "IRD_excess": 0.7,
     "trajectory_error": 0.03, "direction_error": 4.0, "foot_sliding": 0.1, "contact_share": 0.4,
@@ -23,13 +20,8 @@ def table(**figures) -> pd.DataFrame:
     rows = {("real", 0): REAL, ("frozen pose", 0): REAL | {"FID": 100.0, "EMD": 11.0}}
     rows |= {(model, 1): MADE | figures for model in BAR_MODELS}
     rows[BAR_MODELS[1], 8] = dict.fromkeys(MADE, 1e6)  # eight steps are not asked
-    return pd.DataFrame(
-        [
-            {"model": model, "steps": steps, "metric": metric, "value": value}
-            for (model, steps), values in rows.items()
-            for metric, value in values.items()
-        ]
-    )
+    cells = [(*row, *cell) for row, values in rows.items() for cell in values.items()]
+    return pd.DataFrame(cells, columns=["model", "steps", "metric", "value"])
 
 
 def met_by(frame: pd.DataFrame) -> dict:
@@ -71,9 +63,3 @@ def test_what_was_not_measured_is_said():
     assert alone.pop("Classifier, held-out accuracy") == "both"
     assert set(alone.values()) == {"not measured"}
     refused("no rows of real motion", quality_bars, frame[frame["model"] != "real"], 0.9)
-
-
-def test_what_is_asked_and_distilled_is_the_walker_that_ships():
-    """Both name it, where a run would take it from the profile."""
-    ours = load_profile("laptop", "bandai").preset
-    assert BAR_MODELS[1] == ours and ours in ONE_STEP_MODELS

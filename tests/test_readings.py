@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from builders import CHANNELS, SKELETON, random_frames
+from builders import CHANNELS, SKELETON, random_frames, refused
 from test_campaign import PROFILE, STYLES, judges, packed, small  # noqa: F401  (fixtures)
 
 from f3amd_companion.measuring import campaign, fingerprint
@@ -62,15 +62,13 @@ def test_losses_of_several_readings_add_up_and_the_same_one_twice_is_refused():
     centimetres = {"position": 1e4, "joint_velocity": 1e4, "foot": 1e4, "ird": 1e2}
     assert recipe.loss == {"raw_features": True, **centimetres}
     for twice in ("geometry-in-centimetres+no-IRD", "CAMDM-units+CAMDM-units"):
-        with pytest.raises(ValueError, match="the same setting"):
-            find_recipe(twice)
+        refused("the same setting", find_recipe, twice)
 
 
 def test_camdm_in_its_own_units_keeps_its_losses_and_no_other_change_of_them():
     loss = find_recipe("CAMDM-units").on("CAMDM").config(10, 4, 0).loss
     assert loss.raw_features and loss.ird == 0.0
-    with pytest.raises(ValueError, match="loss"):
-        find_recipe("IRD-squared").on("CAMDM")
+    refused("loss", find_recipe("IRD-squared").on, "CAMDM")
 
 
 def test_spectral_weights_of_li_et_al_begin_small_and_positive():
@@ -91,8 +89,7 @@ def test_a_bypass_adds_each_blocks_input_and_changes_nothing_else():
     condition, x = Condition(draw(1, 10, CHANNELS), draw(1, 8, 8), jnp.eye(2)[:1]), draw(1, 8, CHANNELS)
     stations = [dict(net.stages(x, 1.0, net.encode(condition))) for net in (plain, bypass)]
     np.testing.assert_allclose(stations[1]["block 1"], stations[0]["block 1"] + stations[0]["encoder"], atol=1e-5)
-    with pytest.raises(ValueError, match="bypass"):
-        VariantConfig(channels=9, num_styles=1, block_bypass=True, block_residual=True)
+    refused("bypass", VariantConfig, channels=9, num_styles=1, block_bypass=True, block_residual=True)
 
 
 def test_a_coordinate_tells_the_encoder_where_a_frame_is():
@@ -114,8 +111,7 @@ def test_queue_and_plan_hold_each_reading_beside_camdms_units():
     assert [windows for _, windows in plan] == [3_200_000, 6_400_000, 19_400_000] * 2
     config = plan[0][0].config(194_000, 128)
     assert (config.batch_size, config.num_steps, config.loss.raw_features) == (512, 37_890, True)
-    with pytest.raises(ValueError, match="package"):
-        queue(campaign.GPU_PLAN, "AA")
+    refused("package", queue, campaign.GPU_PLAN, "AA")
 
 
 @pytest.mark.slow

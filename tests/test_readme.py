@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import tomllib
 
 import fill_numbers as fill
 import pytest
@@ -48,16 +47,3 @@ def test_the_moving_picture_is_wide_long_and_of_the_weights_that_ship():
     assert record["weights_digests"] == digests, "other weights ship now: draw it anew, scripts/side_by_side.py"
     credit = record["dataset_credit"].partition(";")[0]
     assert credit.endswith(record["dataset_licence"]) and credit in " ".join(README.split()) and HERO.name in README
-
-
-def test_addresses_that_the_project_names_stand_where_readers_look():
-    urls = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"].get("urls", {})
-    cited = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
-    assert [
-        url for name, url in urls.items() if url not in README or (name != "Documentation" and url not in cited)
-    ] == []
-
-
-def test_the_reading_map_has_every_notebook():
-    listed = re.findall(r"^\|[^|]*\| `(\d\d_\w+)` \|", (ROOT / "docs/map.md").read_text(encoding="utf-8"), re.M)
-    assert listed == sorted(path.stem for path in (ROOT / "notebooks").glob("[0-9]*.ipynb"))

@@ -44,9 +44,8 @@ def test_every_recipe_changes_one_thing(prepared):
     large = campaign.RECIPES["batch-512"].config(1000, 8, 0)
     assert large.batch_size == 512 and large.num_steps == 1000 * 8 // 512, "as many windows"
     plus = campaign.RECIPES["plus"].config(100, 8, 0)
-    assert plus.own_history_share == presets.find_preset("F3AMD-FNO-96-plus").training[
-        "own_history_share"
-    ]  # fmt: skip
+    named = presets.find_preset("F3AMD-FNO-96-plus").training
+    assert plus.own_history_share == named["own_history_share"]
 
 
 def test_how_long_a_model_was_trained_is_written_down(prepared, tmp_path, monkeypatch):

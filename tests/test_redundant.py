@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from builders import refused
 from scipy.ndimage import gaussian_filter1d
 
 from f3amd_lib.motion import synthetic
@@ -176,5 +177,4 @@ def test_the_shortest_turn():
 )
 def test_what_cannot_be_turned_is_refused(call, words):
     motion = MOTIONS[23]
-    with pytest.raises(ValueError, match=words):
-        call(motion.skeleton, motion.positions)
+    refused(words, call, motion.skeleton, motion.positions)

@@ -1,10 +1,10 @@
 """Records, tables, the paper's numbers, figures and pictures."""
 
-import dataclasses
 import json
 import os
 import subprocess
 import tempfile
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -29,14 +29,8 @@ FRAME = pd.DataFrame({"model": ["a", "b"], "value": [0.1 + 0.2, float("nan")], "
 
 
 def test_record_says_what_ran_where():
-    @dataclasses.dataclass
-    class Data:
-        name: str = "bandai"
-        fingerprint: str = "ab12"
-        licence: str = "CC BY-NC 4.0"
-        credit: str = "somebody"
-
-    made = record(dataset=Data(), steps=np.int64(8), times=np.array([1.5, 2.5]))
+    data = SimpleNamespace(name="bandai", fingerprint="ab12", licence="CC BY-NC 4.0", credit="somebody")
+    made = record(dataset=data, steps=np.int64(8), times=np.array([1.5, 2.5]))
     assert made["dataset"] == "bandai" and made["dataset_fingerprint"] == "ab12"
     assert made["steps"] == 8 and made["times"] == [1.5, 2.5]
     assert set(made["versions"]) >= {"python", "jax", "flax", "optax", "numpy"}
@@ -66,9 +60,8 @@ def test_git_state_of_a_checkout(tmp_path, monkeypatch):
 
     def git(*arguments):
         identity = ["-c", "user.name=t", "-c", "user.email=t@example.org"]
-        done = subprocess.run(
-            ["git", "-C", str(tmp_path), *identity, *arguments], check=True, capture_output=True, text=True
-        )
+        words = ["git", "-C", str(tmp_path), *identity, *arguments]
+        done = subprocess.run(words, check=True, capture_output=True, text=True)
         return done.stdout.strip()
 
     monkeypatch.setattr(records, "_CHECKOUT", str(tmp_path))

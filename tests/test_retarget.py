@@ -14,7 +14,7 @@ from f3amd_lib.motion.anatomy import joint_roles
 from f3amd_lib.motion.plausible import as_person
 from f3amd_lib.motion.retarget import DOUBTFUL, retarget
 from f3amd_lib.motion.root_paths import named_path
-from f3amd_lib.motion.skeleton import Motion, Skeleton, resample
+from f3amd_lib.motion.skeleton import Motion, resample
 from f3amd_lib.motion.synthetic import synthesize
 from f3amd_lib.rollout.start_poses import start_history
 from f3amd_lib.training.checkpoints import load_model
@@ -71,12 +71,7 @@ def test_the_same_person_in_another_size_comes_back_to_the_millimetre(walk):
 
 
 def test_an_error_is_seen_where_there_is_one_and_a_large_one_refused(walk, caplog):
-    bent = Skeleton(
-        walk.skeleton.names,
-        walk.skeleton.parents,
-        walk.skeleton.offsets * np.array([2.5, 1, 1]),
-        walk.skeleton.end_sites,
-    )
+    bent = dataclasses.replace(walk.skeleton, offsets=walk.skeleton.offsets * np.array([2.5, 1, 1]))
     reference = walk.replace(skeleton=bent)
     with caplog.at_level("WARNING"):
         assert retarget(walk, reference)[2].mean() > DOUBTFUL

@@ -48,20 +48,14 @@ def obedient(trained, window=WINDOW):
     return generator
 
 
+@pytest.mark.parametrize("place", [((0.0, 0.0), 0.0), ((30.0, -20.0), 2.0)])
 @pytest.mark.parametrize("name", ["straight", "circle", "slalom"])
-def test_a_perfect_network_walks_exactly_on_the_path(trained, name):
-    path = named_path(name, 3 * WINDOW)
-    rollout = obedient(trained).rollout(path, "calm")
-    frames = rollout.frames[0]
-    assert frames.shape == (3 * WINDOW, CHANNELS)
-    np.testing.assert_allclose(frames[:, [0, 2]], path.position, atol=1e-5)
-    np.testing.assert_allclose(wrap_angle(frame_yaw(SKELETON, frames.astype(float)) - path.yaw), 0.0, atol=1e-4)
-
-
-def test_paths_anywhere_facing_anywhere_are_followed(trained):
-    path = placed(named_path("circle", 3 * WINDOW), (30.0, -20.0), 2.0)
+def test_paths_anywhere_facing_anywhere_are_followed(trained, name, place):
+    path = placed(named_path(name, 3 * WINDOW), *place)
     frames = obedient(trained).rollout(path, "calm").frames[0]
-    np.testing.assert_allclose(frames[:, [0, 2]], path.position, atol=5e-5)
+    assert frames.shape == (3 * WINDOW, CHANNELS)
+    np.testing.assert_allclose(frames[:, [0, 2]], path.position, atol=5e-5 if place[1] else 1e-5)
+    np.testing.assert_allclose(wrap_angle(frame_yaw(SKELETON, frames.astype(float)) - path.yaw), 0.0, atol=1e-4)
 
 
 def test_seams_of_a_perfect_network_are_steps_like_any_other(trained):
@@ -72,7 +66,7 @@ def test_seams_of_a_perfect_network_are_steps_like_any_other(trained):
     np.testing.assert_allclose(steps, 1.2 / 30, atol=1e-5)
 
 
-def test_histories_may_be_longer_than_windows():
+def test_each_round_starts_from_the_frames_made_before_and_histories_may_be_longer_than_windows():
     window, history = 3, 5
     trained = tiny_trained(window=window, num_history=history, num_kept_modes=2)
     start = np.tile(np.concatenate([[0.0, 0.9, 0.0], POSE]), (1, history, 1))
@@ -219,12 +213,6 @@ def test_styles_without_a_starting_pose_need_a_history():
     refused("'proud': pass `history`", generator.rollout, path, "proud")
     history = np.tile(np.concatenate([[0.0, 0.9, 0.0], POSE]), (1, HISTORY, 1))
     assert generator.rollout(path, "proud", history=history).frames.shape == (1, 10, CHANNELS)
-
-
-def test_each_round_starts_from_the_frames_made_before(trained):
-    rollout = obedient(trained).rollout(named_path("straight", 4 * WINDOW), "calm")
-    height = rollout.history[0, -1, 1] + np.arange(1, 4 * WINDOW + 1)
-    np.testing.assert_allclose(rollout.frames[0, :, 1], height, rtol=1e-5)
 
 
 def test_the_path_of_one_character_is_nothing_to_another(network_generator):

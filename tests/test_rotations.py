@@ -12,13 +12,12 @@ from f3amd_lib.motion import rotations
 def elementary(axis: str, angle: float) -> np.ndarray:
     """A right-handed turn about one axis, written out."""
     c, s = np.cos(angle), np.sin(angle)
-    return np.array(
-        {
-            "X": [[1, 0, 0], [0, c, -s], [0, s, c]],
-            "Y": [[c, 0, s], [0, 1, 0], [-s, 0, c]],
-            "Z": [[c, -s, 0], [s, c, 0], [0, 0, 1]],
-        }[axis]
-    )
+    turns = {
+        "X": [[1, 0, 0], [0, c, -s], [0, s, c]],
+        "Y": [[c, 0, s], [0, 1, 0], [-s, 0, c]],
+        "Z": [[c, -s, 0], [s, c, 0], [0, 0, 1]],
+    }
+    return np.array(turns[axis])
 
 
 def random_matrices(count: int, seed: int = 0) -> np.ndarray:

@@ -147,21 +147,6 @@ def test_ddpm_posterior_is_camdms():
     np.testing.assert_allclose(np.log(variance[1:]), [-2.071257, -0.870617, -0.156659], atol=1e-6)
 
 
-@pytest.mark.parametrize(("alpha_bar", "alpha_bar_next"), [(0.1, 0.7), (0.6, 0.65), (0.01, 0.99)])
-def test_ddpm_posterior_is_bayes_rule(alpha_bar, alpha_bar_next):
-    # p(z_next | z, x0) is p(z | z_next) p(z_next | x0): both are Gaussians of the forward process.
-    x0, z = 0.8, -0.3
-    z_next = np.linspace(-8.0, 8.0, 40_001)
-    alpha = alpha_bar / alpha_bar_next
-    prior = np.exp(-0.5 * (z_next - np.sqrt(alpha_bar_next) * x0) ** 2 / (1.0 - alpha_bar_next))
-    likelihood = np.exp(-0.5 * (z - np.sqrt(alpha) * z_next) ** 2 / (1.0 - alpha))
-    density = prior * likelihood / np.sum(prior * likelihood)
-    mean = np.sum(z_next * density)
-    on_x0, on_z, variance = ddpm_posterior(alpha_bar, alpha_bar_next)
-    assert on_x0 * x0 + on_z * z == pytest.approx(mean, abs=1e-9)
-    assert variance == pytest.approx(np.sum((z_next - mean) ** 2 * density), rel=1e-9)
-
-
 def test_ddpm_step_by_hand():
     # From sigma 2 to 1 a quarter of the seen noise stays: 1 + (5 - 1) / 4. Fresh: sqrt(1 - 1/4).
     assert ddpm_step(5.0, 1.0, 2.0, 1.0, 0.0) == pytest.approx(2.0)

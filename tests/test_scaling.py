@@ -26,5 +26,4 @@ def test_machines_take_the_first_leg_that_may_begin(machines, ends):
 def test_the_page_says_what_the_records_say():
     page = scaling.PAGE.read_text(encoding="utf-8")
     assert scaling.written(page) == page
-    assert "| 37.5 |" not in page or scaling.written(page.replace("37.5", "99.9")) == page  # it can fail
     refused("no `<!-- costs: begin -->`", scaling.written, page.replace("<!-- costs: begin -->", ""))

@@ -14,12 +14,7 @@ from f3amd_lib.diffusion.schedules import variance_exploding
 # Cube roots 2 and 1: every level of this schedule can be worked out by hand.
 HAND = schedules.variance_exploding(sigma_max=8.0, sigma_min=1.0, rho=3.0)
 
-EACH_VP = [
-    schedules.variance_preserving_cosine(),
-    schedules.variance_preserving_linear(),
-    schedules.variance_preserving_betas(),
-]
-EACH = [schedules.variance_exploding(), schedules.straight(), *EACH_VP]
+EACH = [make() for make in schedules.SCHEDULES.values()]
 
 
 def betas(schedule):
@@ -45,23 +40,15 @@ def test_eq09_training_draws_t_uniformly():
     np.testing.assert_allclose(np.cbrt(drawn), np.cbrt(schedule.sigma(np.linspace(0.0, 1.0, 10_000))), atol=0.1)
 
 
-# Cosine levels as CAMDM's released configuration holds them (K = 4), and as its formula gives.
-@pytest.mark.parametrize(
-    ("num_levels", "of", "expected"),
-    [
-        (4, betas, [0.152988, 0.416958, 0.707859, 0.999]),
-        (4, lambda schedule: schedule.alpha_bars, [0.847012, 0.493844, 0.144272, 0.000144]),
-        (
-            8,
-            lambda schedule: schedule.alpha_bars,
-            [0.957805, 0.847012, 0.684227, 0.493844, 0.304395, 0.144272, 0.037472, 0.000037],
-        ),
-    ],
-)
-def test_cosine_levels_are_camdms(num_levels, of, expected):
-    found = of(schedules.variance_preserving_cosine(num_levels))
-    assert found.dtype == np.float64
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
+def test_cosine_levels_are_camdms():
+    """As its released configuration holds them (K = 4), and as its formula gives (K = 8)."""
+    four, eight = (schedules.variance_preserving_cosine(count) for count in (4, 8))
+    assert four.alpha_bars.dtype == np.float64
+    np.testing.assert_allclose(betas(four), [0.152988, 0.416958, 0.707859, 0.999], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(four.alpha_bars, [0.847012, 0.493844, 0.144272, 0.000144], rtol=0, atol=1e-6)
+    between = [0.957805, 0.684227, 0.304395, 0.037472]
+    np.testing.assert_allclose(eight.alpha_bars[::2], between, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(eight.alpha_bars[1:-1:2], four.alpha_bars[:-1], rtol=0, atol=1e-6)
 
 
 def test_linear_levels_by_hand():
@@ -149,28 +136,22 @@ def test_impossible_grids_are_refused(schedule):
 
 
 @pytest.mark.parametrize(
-    ("schedule", "values"),
-    [
-        # As versions 0.2 and later wrote them beside weights.
-        (
-            schedules.variance_exploding(64.0, 0.02, 7.0),
-            {"kind": "variance_exploding", "sigma_max": 64.0, "sigma_min": 0.02, "rho": 7.0},
-        ),
-        (
-            schedules.variance_preserving_betas(50, 0.01, 0.2, 1.0),
-            {"kind": "variance_preserving_betas", "num_levels": 50, "first": 0.01, "last": 0.2, "power": 1.0},
-        ),
-        (schedules.straight(), {"kind": "straight"}),
+    ("kind", "settings"),
+    [  # As versions 0.2 and later wrote them beside weights.
+        ("variance_exploding", {"sigma_max": 64.0, "sigma_min": 0.02, "rho": 7.0}),
+        ("variance_preserving_betas", {"num_levels": 50, "first": 0.01, "last": 0.2, "power": 1.0}),
+        ("straight", {}),
     ],
 )
-def test_schedules_go_through_json_and_come_back(schedule, values):
+def test_schedules_go_through_json_and_come_back(kind, settings):
+    schedule, values = getattr(schedules, kind)(**settings), {"kind": kind, **settings}
     assert schedule.to_dict() == values
     back = schedules.schedule_from_dict(json.loads(json.dumps(values)))
     assert back == schedule and hash(back) == hash(schedule) and repr(back) == repr(schedule)
     np.testing.assert_array_equal(back.grid(3), schedule.grid(3))
     # What is not said takes its default, and another setting is another schedule.
-    default = schedules.schedule_from_dict({"kind": schedule.kind})
-    assert default == schedules.SCHEDULES[schedule.kind]() and (default == schedule) == (len(values) == 1)
+    default = schedules.schedule_from_dict({"kind": kind})
+    assert default == schedules.SCHEDULES[kind]() and (default == schedule) == (not settings)
 
 
 @pytest.mark.parametrize(

@@ -57,13 +57,8 @@ def packed():
     """A slow and a fast mover, the first half of each for training and the second to test."""
     slow, fast = wandering_motion(480, 0), wandering_motion(960, 1)
     fast = fast.replace(root_position=fast.root_position[::2], rotations=fast.rotations[::2])
-    return packed_from(
-        [
-            (motion.slice(start, start + 240), style, split)
-            for style, motion in enumerate((slow, fast))
-            for start, split in ((0, 0), (240, 2))
-        ]
-    )
+    halves = lambda motion, style: [(motion.slice(0, 240), style, 0), (motion.slice(240, 480), style, 2)]
+    return packed_from(halves(slow, 0) + halves(fast, 1))
 
 
 @pytest.fixture(scope="module")

@@ -14,33 +14,18 @@ from f3amd_lib.motion.synthetic import SYNTHETIC_SKELETON, synthesize
 # Offsets in cm of the Bandai rig without joint_Root: bones along +X on the left, along -X on the
 # right; the tiny numbers are the rig's own.
 _BANDAI = [
-    ("Hips", -1, (0, 0, 0)),
-    ("Spine", 0, (15.7357, 0, 0)),
-    ("Chest", 1, (8.98455, -0.406207, 0)),
-    ("Neck", 2, (16.3773, 0, 0)),
-    ("Head", 3, (6.45672, 0, 0)),
-    ("Shoulder_L", 2, (12.9942, -0.242716, 4.98039)),
-    ("UpperArm_L", 5, (5.34809, 0, 0)),
-    ("LowerArm_L", 6, (24.3286, 0, 0)),
-    ("Hand_L", 7, (22.2916, 0, 0)),
-    ("Shoulder_R", 2, (12.9945, -0.242716, -4.98039)),
-    ("UpperArm_R", 9, (-5.34813, 0, 0)),
-    ("LowerArm_R", 10, (-24.3289, 0.000322, 0)),
-    ("Hand_R", 11, (-22.2915, -0.000108, 0)),
-    ("UpperLeg_L", 0, (-2.19248, -6.46944, 0)),
-    ("LowerLeg_L", 13, (39.0811, 0, 0)),
-    ("Foot_L", 14, (40.9854, 0, 0)),
-    ("Toes_L", 15, (11.7543, 0, 0)),
-    ("UpperLeg_R", 0, (-2.19251, 6.46944, 0)),
-    ("LowerLeg_R", 17, (-39.0811, -0.002282, -0.040193)),
-    ("Foot_R", 18, (-40.9854, 0, 0)),
+    ("Hips", -1, (0, 0, 0)), ("Spine", 0, (15.7357, 0, 0)), ("Chest", 1, (8.98455, -0.406207, 0)),
+    ("Neck", 2, (16.3773, 0, 0)), ("Head", 3, (6.45672, 0, 0)), ("Shoulder_L", 2, (12.9942, -0.242716, 4.98039)),
+    ("UpperArm_L", 5, (5.34809, 0, 0)), ("LowerArm_L", 6, (24.3286, 0, 0)), ("Hand_L", 7, (22.2916, 0, 0)),
+    ("Shoulder_R", 2, (12.9945, -0.242716, -4.98039)), ("UpperArm_R", 9, (-5.34813, 0, 0)),
+    ("LowerArm_R", 10, (-24.3289, 0.000322, 0)), ("Hand_R", 11, (-22.2915, -0.000108, 0)),
+    ("UpperLeg_L", 0, (-2.19248, -6.46944, 0)), ("LowerLeg_L", 13, (39.0811, 0, 0)),
+    ("Foot_L", 14, (40.9854, 0, 0)), ("Toes_L", 15, (11.7543, 0, 0)), ("UpperLeg_R", 0, (-2.19251, 6.46944, 0)),
+    ("LowerLeg_R", 17, (-39.0811, -0.002282, -0.040193)), ("Foot_R", 18, (-40.9854, 0, 0)),
     ("Toes_R", 19, (-11.7543, 0, 0)),
-]
-BANDAI = Skeleton(
-    names=tuple(name for name, _, _ in _BANDAI),
-    parents=tuple(parent for _, parent, _ in _BANDAI),
-    offsets=np.array([offset for _, _, offset in _BANDAI]) / 100.0,
-)
+]  # fmt: skip
+_NAMES, _PARENTS, _OFFSETS = zip(*_BANDAI, strict=True)
+BANDAI = Skeleton(_NAMES, _PARENTS, np.array(_OFFSETS) / 100.0)
 
 
 def random_motion(rig: Skeleton, frames: int = 12, seed: int = 0, fps: float = 30.0) -> Motion:
@@ -235,7 +220,6 @@ def test_broken_motions_are_refused_by_name_and_frame():
     root = np.zeros((4, 3))
     eye = np.broadcast_to(np.eye(3), (4, 5, 3, 3)).copy()
     refused(r"motion 'clip': rotations must be \[3, 5, 3, 3\]", Motion, legs(), root[:3], eye, name="clip")
-    refused(r"rotations must be \[4, 5, 3, 3\]", Motion, legs(), root, eye[:, 1:])
     refused("no length 0", Motion, legs(), root[:0], eye[:0])
     refused("fps must be above 0, got 0", Motion, legs(), root, eye, fps=0)
     root[2, 1] = np.nan

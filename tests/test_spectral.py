@@ -64,19 +64,6 @@ def test_eq02_initial_weights_keep_the_variance(variant, num_frames):
     assert variance == pytest.approx(1.0 - halved, abs=0.03)
 
 
-def test_default_layer_has_the_weights_that_files_hold():
-    block = FNOBlock(3, 4, 5, rngs=nnx.Rngs(params=0))
-    shapes = {".".join(path): leaf[...].shape for path, leaf in nnx.to_flat_state(nnx.state(block))}
-    assert shapes == {
-        "spectral.weight_real": (5, 3, 4),
-        "spectral.weight_imag": (5, 3, 4),
-        "local_first.kernel": (3, 3, 3),
-        "local_first.bias": (3,),
-        "local_second.kernel": (3, 3, 4),
-        "local_second.bias": (4,),
-    }
-
-
 @pytest.mark.parametrize("num_frames", [1, 7, 32])
 def test_table_8_cosine_basis_is_orthonormal(num_frames):
     basis = cosine_basis(num_frames)
@@ -120,11 +107,8 @@ def test_eq02_factors_of_a_kernel_of_rank_eight_equal_the_dense_layer(num_frames
     layer.second_real[...] = jnp.asarray(second.real)
     layer.second_imag[...] = jnp.asarray(second.imag)
     z = draw(2, num_frames, 12)
-    got, expected = Compiled(layer)(z), fft_convolution(z, dense.real, dense.imag)
-    tolerance = 1e-5 * np.abs(expected).max()
-    np.testing.assert_allclose(got, expected, atol=tolerance)
-    dense_layer = spectral_convolution(jnp.asarray(z), dense.real, dense.imag)
-    np.testing.assert_allclose(got, dense_layer, atol=tolerance)
+    expected = fft_convolution(z, dense.real, dense.imag)
+    np.testing.assert_allclose(Compiled(layer)(z), expected, atol=1e-5 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("rank", [0, 4])

@@ -37,14 +37,8 @@ def test_bars_take_the_fastest_way_and_say_what_is_met():
     assert bars["met"].tolist() == ["yes", "no", "yes", "yes", "yes", "yes", "yes", "no"]
 
 
-def rows(*values):
-    columns = ["model", "steps", "framework", "way", "characters", "value", "precision"]
-    table = pd.DataFrame(values, columns=columns)
-    return table.assign(window_frames=32, device="CPU", suite="main")
-
-
 def test_fastest_way_of_each_framework_in_float32():
-    table = rows(
+    rows = (
         ("CAMDM", 8, "jax", "jit", 1, 3.0, "float32"),
         ("CAMDM", 8, "jax", "jit, all devices", 1, 2.0, "float32"),
         ("CAMDM", 8, "jax", "jit", 1, 1.0, "bfloat16"),
@@ -52,8 +46,9 @@ def test_fastest_way_of_each_framework_in_float32():
         ("F3AMD-FNO-96", 1, "jax", "jit, FFT", 1, 0.5, "float32"),
         ("F3AMD-FNO-96", 1, "jax", "jit", 1, 0.7, "float32"),
     )
-    table.index = [0] * len(table)  # as pieces of several runs have
-    found = speed_tables.fastest_implementations(table)
+    columns = ["model", "steps", "framework", "way", "characters", "value", "precision"]
+    table = pd.DataFrame(rows, [0] * len(rows), columns)  # an index as pieces of several runs have
+    found = speed_tables.fastest_implementations(table.assign(window_frames=32, device="CPU", suite="main"))
     assert list(found["value"]) == [2.0, 4.0, 0.7]
     assert list(found["way"]) == ["jit, all devices", "PyTorch", "jit"]
 

@@ -26,19 +26,10 @@ def test_a_right_angle_walked_by_hand():
     steps = np.repeat([[0.0, 0.001, 0.03], [0.04, -0.001, 0.0]], 30, axis=0)
     root = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)]) + [5.0, 0.9, 5.0]
     found = clip_statistics(moving_legs(root, np.full(61, 90.0)))
-    assert found == pytest.approx(
-        {
-            "path_length_m": 2.1,
-            "net_distance_m": 1.5,
-            "mean_speed_m_s": 1.05,
-            "start_yaw_deg": 90.0,
-            "net_yaw_change_deg": 0.0,
-            "lowest_joint_y_cm": 5.0,
-            "lowest_toe_y_cm": 5.0,
-            "toe_contact_fraction": 0.0,
-        },
-        abs=1e-9,
-    )
+    wanted = {"path_length_m": 2.1, "net_distance_m": 1.5, "mean_speed_m_s": 1.05}
+    wanted |= {"start_yaw_deg": 90.0, "net_yaw_change_deg": 0.0}
+    wanted |= {"lowest_joint_y_cm": 5.0, "lowest_toe_y_cm": 5.0, "toe_contact_fraction": 0.0}
+    assert found == pytest.approx(wanted, abs=1e-9)
 
 
 def test_turning_is_counted_through_the_seam_at_180_degrees():

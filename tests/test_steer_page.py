@@ -39,7 +39,7 @@ BUNDLE = b"var a=1,b=import.meta.url;export{a as InferenceSession,b as default};
 def in_node(tmp_path, body: str, **given):
     """Run a script with motion.js as `m` and `given`; what it hands to `say` comes back."""
     (tmp_path / "motion.mjs").write_bytes((FOLDER / "motion.js").read_bytes())
-    (tmp_path / "given.json").write_text(json.dumps(given))
+    (tmp_path / "given.json").write_text(json.dumps(given, default=np.ndarray.tolist))
     (tmp_path / "test.mjs").write_text(
         'import * as m from "./motion.mjs"; import { readFileSync } from "node:fs";'
         'const given = JSON.parse(readFileSync("given.json"));'
@@ -83,19 +83,15 @@ def test_kinematics_blending_and_rotations_are_alike(tmp_path, trained):
     history, window = builders.random_frames((5,), 1), builders.random_frames((8,), 2)
     near = orthonormalise(history[-1:] + 0.1 * np.random.default_rng(0).normal(size=(8, builders.CHANNELS)))
     rough = 1.3 * window + 0.1
-    found = in_node(
-        tmp_path,
+    script = (
         "const history = frames(given.history);"
         "say([frames(given.window).map((f) => m.jointPositions(given.skeleton, f)),"
         " frames(given.rough).map(m.orthonormalise),"
         " m.blendSeam(history, frames(given.window), 4), m.blendSeam(history, frames(given.near), 6),"
-        " m.blendSeam(history, frames(given.window), 0)])",
-        history=history.tolist(),
-        window=window.tolist(),
-        near=near.tolist(),
-        rough=rough.tolist(),
-        skeleton=model_card(trained, 1)["skeleton"],
+        " m.blendSeam(history, frames(given.window), 0)])"
     )
+    given = {"history": history, "window": window, "near": near, "rough": rough}
+    found = in_node(tmp_path, script, skeleton=model_card(trained, 1)["skeleton"], **given)
     joints = 3 * skeleton.num_joints
     positions = np.reshape(np.array(found[0])[:, :joints], (8, -1, 3))
     np.testing.assert_allclose(positions, frame_positions(skeleton, window), atol=1e-6)
@@ -121,24 +117,18 @@ def test_rounds_under_way_are_alike_for_the_same_noise(tmp_path, trained):
     noise = np.random.default_rng(1).standard_normal((3, 2, builders.WINDOW, builders.CHANNELS)).astype(np.float32)
     speed, direction, style = [1.2, 0.0], [2.0, 0.0], np.array([[0.25, 0.75], [1.0, 0.0]])
     wanted = [steering.advance(speed, direction, style, one) for one in noise]
-    found = in_node(
-        tmp_path,
-        TOY + "const characters = given.poses.map((pose, k) =>"
+    script = (
+        "const characters = given.poses.map((pose, k) =>"
         "  m.startCharacter(frames(pose), ...given.places[k], given.headings[k]));"
         "const made = []; for (const noise of given.noise)"
         "  made.push((await m.advance(given.card, characters, given.wishes, given.style, async (...a) => toy(...a),"
         "    noise, given.sigmas, 3, 2)).map(({ frames }) => frames));"
-        "say([made, characters.map(({ target }) => [target.x, target.z, target.heading, target.speed])])",
-        card=model_card(trained, 1) | {"window": builders.WINDOW},
-        kept=builders.HISTORY,
-        poses=[pose.tolist() for pose in poses],
-        places=places,
-        headings=headings,
-        wishes=[{"speed": s, "direction": d} for s, d in zip(speed, direction, strict=True)],
-        style=style.tolist(),
-        noise=[one.ravel().tolist() for one in noise],
-        sigmas=SIGMAS.tolist(),
+        "say([made, characters.map(({ target }) => [target.x, target.z, target.heading, target.speed])])"
     )
+    given = {"poses": poses, "places": places, "headings": headings, "style": style, "noise": noise.reshape(3, -1)}
+    given |= {"kept": builders.HISTORY, "sigmas": SIGMAS, "card": model_card(trained, 1) | {"window": builders.WINDOW}}
+    given["wishes"] = [{"speed": s, "direction": d} for s, d in zip(speed, direction, strict=True)]
+    found = in_node(tmp_path, TOY + script, **given)
     np.testing.assert_allclose(found[0], wanted, atol=1e-4)
     target = steering.target
     ends = np.column_stack([target.position, target.heading, target.speed])
@@ -157,20 +147,17 @@ def test_feet_are_held_alike(tmp_path):
     for frame, locking in zip(frames[10:], asked, strict=True):
         feet, settled = lock_frame(SYNTHETIC_SKELETON, feet, frame, locking=locking)
         wanted.append(settled)
-    legs = leg_chains(SYNTHETIC_SKELETON).tolist()
-    found = in_node(
-        tmp_path,
+    script = (
         "const walk = frames(given.frames), s = given.skeleton, settled = [];"
         "let feet = m.startFeet(s, given.legs, walk.slice(0, 10));"
         "walk.slice(10).forEach((frame, k) => {"
         "  const one = m.lockFrame(s, given.legs, feet, frame, given.asked[k]);"
         "  feet = one.feet; settled.push(one.frame); });"
-        "say([settled, feet.shown, feet.carries])",
-        skeleton=describe_skeleton(SYNTHETIC_SKELETON) | {"offsets": np.asarray(SYNTHETIC_SKELETON.offsets).tolist()},
-        legs=legs,
-        frames=frames.tolist(),
-        asked=asked,
+        "say([settled, feet.shown, feet.carries])"
     )
+    skeleton = describe_skeleton(SYNTHETIC_SKELETON) | {"offsets": SYNTHETIC_SKELETON.offsets}
+    given = {"legs": leg_chains(SYNTHETIC_SKELETON), "frames": frames, "asked": asked}
+    found = in_node(tmp_path, script, skeleton=skeleton, **given)
     np.testing.assert_allclose(found[0], wanted, atol=1e-4)
     np.testing.assert_allclose(found[1], feet.shown, atol=1e-6)
     assert found[2] == feet.carries.tolist()

@@ -42,6 +42,7 @@ def test_measured_tables_are_those_of_the_data_set_then_bandais_and_say_so(tmp_p
 
 # -------------------------------------------------------------------------- what a record was measured with
 
+OTHER_A = "was measured with other weights of A (ab, now aa)"
 REFERENCE = {"weights_digests": {"A": ["aa"], "real": ["cc"]}, "classifier_weights": "cc"}
 
 
@@ -50,15 +51,11 @@ REFERENCE = {"weights_digests": {"A": ["aa"], "real": ["cc"]}, "classifier_weigh
     [
         ("walking", {"weights_digests": {"A": ["aa"], "real": [""]}}, ""),
         ("walking", {"weights_digests": {"B": ["bb"]}}, ""),
-        ("walking", {"weights_digests": {"A": ["ab"]}}, "was measured with other weights of A (ab, now aa)"),
+        ("walking", {"weights_digests": {"A": ["ab"]}}, OTHER_A),
         ("walking", {"weights_digests": {"A": ["aa", "ab"]}}, "was measured with other weights of A (aa, ab, now aa)"),
         ("walking", {}, "does not say which weights it was measured with"),
         ("one_step", {"weights_digests": {"A, distilled": ["aa"]}, "classifier_weights": "cc"}, ""),
-        (
-            "one_step",
-            {"weights_digests": {"A, distilled": ["ab"]}},
-            "was measured with other weights of A (ab, now aa)",
-        ),
+        ("one_step", {"weights_digests": {"A, distilled": ["ab"]}}, OTHER_A),
         ("quality_by_seed", {"weights_digests": {"A": ["aa"]}, "classifier_weights": "cc"}, ""),
         ("quality_by_epoch", {"classifier_weights": "cd"}, "was seen through another style classifier (cd, now cc)"),
         ("quality_by_epoch", {}, "was seen through another style classifier (None, now cc)"),
@@ -76,14 +73,11 @@ def test_a_record_of_other_weights_or_another_classifier_is_stale(name, record, 
 def test_a_stale_table_is_marked_for_notebooks(tmp_path, monkeypatch):
     monkeypatch.setattr(stored, "repository_root", lambda: tmp_path)
     folder = tmp_path / "paper_figures/bandai/laptop/records"
-    record = records.run_record(profile="laptop", dataset="bandai", seed=0)
-    records.write_table(
-        folder / "quality.csv", pd.DataFrame({"value": [1.0]}), record | {"weights_digests": {"A": ["aa"]}}
-    )
+    record, table = records.run_record(profile="laptop", dataset="bandai", seed=0), pd.DataFrame({"value": [1.0]})
+    measured_with = lambda digest: record | {"weights_digests": {"A": [digest]}}
+    records.write_table(folder / "quality.csv", table, measured_with("aa"))
     for digest, stale in (("aa", False), ("ab", True)):
-        records.write_table(
-            folder / "walking.csv", pd.DataFrame({"value": [1.0]}), record | {"weights_digests": {"A": [digest]}}
-        )
+        records.write_table(folder / "walking.csv", table, measured_with(digest))
         assert measured_table("bandai", "walking", "walking")[1].startswith("**Stale: ") is stale
 
 

@@ -26,18 +26,10 @@ def test_all_files_of_one_walk_are_read_as_it(name):
     assert bool(notes) == (name in CORRECTED)
 
 
-@pytest.mark.parametrize(
-    ("written", "rate"),
-    [
-        (".033", 30),
-        ("0.017", 60),
-        ("0.0333", 30),
-        ("0.04", 25),
-        ("0.0083", 120),
-        ("0.0333333", 1 / 0.0333333),
-        ("0.0331", 1 / 0.0331),
-    ],
-)
+RATES = {".033": 30, "0.017": 60, "0.04": 25, "0.0083": 120, "0.0333333": 1 / 0.0333333, "0.0331": 1 / 0.0331}
+
+
+@pytest.mark.parametrize(("written", "rate"), RATES.items())
 def test_a_frame_time_of_few_digits_is_the_usual_rate_that_is_written_so(written, rate):
     text = re.sub("Frame Time: .*", f"Frame Time: {written}", CASES["plain"].decode())
     assert parse_bvh(text, "walk").fps == rate
@@ -45,8 +37,7 @@ def test_a_frame_time_of_few_digits_is_the_usual_rate_that_is_written_so(written
 
 @pytest.mark.parametrize("name", REFUSED)
 def test_what_has_no_plain_meaning_is_refused_with_its_cause(name):
-    with pytest.raises(ValueError, match=f"(?i){name}, line.*{REFUSED[name]}"):
-        parse_bvh(CASES[name], name)
+    refused(f"(?i){name}, line.*{REFUSED[name]}", parse_bvh, CASES[name], name)
 
 
 @pytest.mark.parametrize("tool", NAMINGS)
@@ -65,11 +56,8 @@ def test_a_wrong_name_does_not_mislead_the_tree():
 def test_cmus_person_has_arms_although_collar_bones_have_no_length():
     skeleton = cmu_skeleton()
     roles = joint_roles(skeleton)
-    assert [skeleton.names[roles[f"left_{part}"]] for part in ("shoulder", "elbow", "wrist")] == [
-        "LeftArm",
-        "LeftForeArm",
-        "LeftHand",
-    ]
+    arm = [skeleton.names[roles[f"left_{part}"]] for part in ("shoulder", "elbow", "wrist")]
+    assert arm == ["LeftArm", "LeftForeArm", "LeftHand"]
     assert leg_length(as_person(still(skeleton))[0].skeleton, roles) == pytest.approx(0.84, abs=0.01)
 
 
@@ -80,8 +68,7 @@ def still(skeleton: Skeleton, frames: int = 4) -> Motion:
 
 def test_a_person_of_no_known_unit_is_refused_and_an_option_overrules_it():
     odd = still(Skeleton(NAMES, walker().skeleton.parents, 3.0 * walker().skeleton.offsets))
-    with pytest.raises(ValueError, match="somebody: its legs are .* --scale"):
-        as_person(odd)
+    refused("somebody: its legs are .* --scale", as_person, odd)
     motion, notes = as_person(odd, scale=0.01 / 3.0)
     assert leg_length(motion.skeleton, joint_roles(motion.skeleton)) == pytest.approx(0.82)
     assert notes
@@ -95,11 +82,8 @@ def test_a_joint_map_overrules_what_the_tree_says(tmp_path, caplog):
         assert main(["joints", str(file), "--joint-map", str(mapped)]) == 0
     said = "\n".join(caplog.messages)
     assert re.search(r"corrected .*walk\.bvh: read in metres", said)
-    for role, name in (
-        ("left_shoulder", "LeftArm"),
-        ("left_wrist", "LeftForeArm"),
-        ("without a role", "Head, LeftHand"),
-    ):
+    wanted = {"left_shoulder": "LeftArm", "left_wrist": "LeftForeArm", "without a role": "Head, LeftHand"}
+    for role, name in wanted.items():
         assert re.search(f"{role} +{name}\n", said)
     assert "left_elbow" not in said
     made = call_by_roles(walker(), read_joint_map(mapped)).skeleton

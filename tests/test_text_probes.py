@@ -24,12 +24,9 @@ def gesture(hands: tuple[str, ...], seed: int = 0, frames: int = 40) -> Motion:
     motion = resample(synthetic.synthesize("Neutral", seconds=2.5, seed=seed), 20.0).slice(0, frames)
     positions, skeleton = np.array(motion.positions), dataclasses.replace(motion.skeleton, end_sites=())
     for hand in hands:
-        positions[frames // 2 :, skeleton.role(f"{hand}_wrist")] = positions[frames // 2 :, skeleton.role("head")] + [
-            0,
-            0.1,
-            0,
-        ]
-    return Motion.from_positions(skeleton, positions, 20.0)  # fmt: skip
+        over_the_head = positions[frames // 2 :, skeleton.role("head")] + [0, 0.1, 0]
+        positions[frames // 2 :, skeleton.role(f"{hand}_wrist")] = over_the_head
+    return Motion.from_positions(skeleton, positions, 20.0)
 
 
 @pytest.fixture(scope="module")
@@ -102,10 +99,8 @@ def test_hands_of_clips_and_of_models_are_kept_in_one_table(data, cache_dir, mon
     monkeypatch.setattr(text_tables, "draw_motions", captioned_motions)
     monkeypatch.setattr(text_tables, "embed_captions", embedded)
     monkeypatch.setattr(text_tables.text_models, "find_text_model", lambda data, name: name)
-    straight = types.SimpleNamespace(kind="straight")
-    model = lambda name: types.SimpleNamespace(
-        name=name, skeleton=data.skeleton, schedule=straight, params=[np.ones(2)]
-    )
+    about = {"skeleton": data.skeleton, "schedule": types.SimpleNamespace(kind="straight"), "params": [np.ones(2)]}
+    model = lambda name: types.SimpleNamespace(name=name, **about)
     monkeypatch.setattr(text_tables.text_models, "load_text_model", model)
     table, record = read_table(measure_hands(data, OneVectorAWord(), PROFILE, models=["as told", "always left"]))
     counts = table.groupby("model")[["motions", "asked_hand", "other_hand"]].sum()

@@ -140,11 +140,6 @@ def test_probe_multiplies_and_counts():
 
 
 def test_bad_input_is_refused():
-    network, stranger = lively(small()), network_of(tiny_config())
-    module = torch_camdm.torch_camdm(network)
-    make, prepare = torch_camdm.torch_camdm, torch_camdm.torch_round
-    for call, message in {
-        lambda: make(stranger): "only CAMDM",
-        lambda: prepare(module, SIGMAS, "ddmp"): "unknown PyTorch sampler 'ddmp'.*'ddpm'",
-    }.items():
-        refused(message, call)
+    refused("only CAMDM", torch_camdm.torch_camdm, network_of(tiny_config()))
+    module = torch_camdm.torch_camdm(lively(small()))
+    refused("unknown PyTorch sampler 'ddmp'.*'ddpm'", torch_camdm.torch_round, module, SIGMAS, "ddmp")

@@ -22,7 +22,6 @@ from f3amd_lib.data import windows as windows_module
 from f3amd_lib.data.features import Normaliser, world_frames
 from f3amd_lib.data.windows import gather_windows
 from f3amd_lib.ground.profiles import load_profile
-from f3amd_lib.measures import real_clips
 from f3amd_lib.motion.root_paths import named_path
 from f3amd_lib.rollout.rollout import MotionGenerator
 from f3amd_lib.rollout.start_poses import starting_poses
@@ -205,11 +204,8 @@ def test_the_moving_average_is_what_a_snapshot_returns(untrained, prepared, monk
     monkeypatch.setattr(campaign, "held_out_terms", lambda task, state, windows: {"loss": 0.0})
     written = {}
     monkeypatch.setattr(campaign, "save_model", lambda path, trained, dtype: written.update(trained.params))
-    run, how = (
-        campaign.Run("F3AMD-FNO-96", window=builders.WINDOW),
-        {"precision": "float32", "stop_at": None, "progress": False},
-    )
-    windows = 4 * untrained.config.batch_size
+    run, windows = campaign.Run("F3AMD-FNO-96", window=builders.WINDOW), 4 * untrained.config.batch_size
+    how = {"precision": "float32", "stop_at": None, "progress": False}
     _, trained, *_ = campaign._trained(prepared, run, windows, batch_size=2, record={}, folder=tmp_path, **how)
     for params in (trained.params, written):
         np.testing.assert_array_equal(params["a"], 2.0 * np.ones(3))
@@ -299,13 +295,6 @@ def test_each_style_starts_from_a_pose_of_its_own():
         assert min(np.abs(pose[:, 1] - height).max() for height in heights) < 1e-5
         other = trained.start_poses["calm" if style == "proud" else "proud"]
         assert min(np.abs(pose[:, 1] - start[:, 1]).max() for start in other) > 1e-3
-
-
-def test_reference_clips_of_a_split_are_of_that_split():
-    packed = builders.packed_from([(wandering(80, number), number % 2, number // 2) for number in range(6)])
-    for number, split in enumerate(("train", "validation", "test")):
-        clips = real_clips.reference_clips(packed, packed.styles, window=builders.WINDOW, split=split)
-        assert sorted(clips) == [2 * number, 2 * number + 1]
 
 
 def test_a_facing_that_flips_and_comes_back_is_smoothed_the_short_way():
