@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from builders import draw, stirred
+from builders import draw, refused, same_tree, stirred
 from flax import nnx
 
 from f3amd_lib.networks import presets
@@ -55,13 +55,10 @@ def test_a_captions_vector_is_scaled_and_no_caption_stays_none():
 # ------------------------------------------------------------------------------------------------- against the facts
 
 
-@pytest.mark.parametrize(
-    ("size", "million"),
-    [
-        ("S", 39.1), ("B", 130.1), pytest.param("L", 306.4, marks=pytest.mark.slow),
-        pytest.param("XL", 596.4, marks=pytest.mark.slow),
-    ],
-)  # fmt: skip
+LARGE = [pytest.param(*one, marks=pytest.mark.slow) for one in (("L", 306.4), ("XL", 596.4))]
+
+
+@pytest.mark.parametrize(("size", "million"), [("S", 39.1), ("B", 130.1), *LARGE])
 def test_parameters_are_those_of_the_released_sizes(size, million):
     config = presets.build_config(f"ACMDM-{size}-PS22", num_joints=22)
     assert presets.count_parameters(config) / 1e6 == pytest.approx(million, abs=0.05)
@@ -86,11 +83,8 @@ def test_patches_put_together_again_are_the_state(patch):
 
 def test_rotary_code_depends_on_distance_alone():
     query, key = normal(2, 1, 1, 1, 8), normal(3, 1, 1, 1, 8)
-    product = lambda p, q: float(
-        jnp.vdot(
-            acmdm.rotated(query, acmdm.rotary_angles([p], 4, 100)), acmdm.rotated(key, acmdm.rotary_angles([q], 4, 100))
-        )
-    )
+    turned = lambda x, place: acmdm.rotated(x, acmdm.rotary_angles([place], 4, 100))
+    product = lambda p, q: float(jnp.vdot(turned(query, p), turned(key, q)))
     assert product(3, 1) == pytest.approx(product(12, 10), abs=1e-5)
     assert abs(product(3, 1) - product(1, 3)) > 1e-2
     angles = acmdm.rotary_angles([1], 32, 200.0)
@@ -161,9 +155,7 @@ def test_text_and_time_reach_the_answer(network):
 def test_one_block_is_full_attention():
     blocks = stirred(fresh(config_of(block_frames=8)))
     full = stirred(fresh(config_of()))
-    np.testing.assert_allclose(
-        answer(blocks, STATE, TIME, condition()), answer(full, STATE, TIME, condition()), atol=1e-6
-    )
+    np.testing.assert_allclose(*(answer(each, STATE, TIME, condition()) for each in (blocks, full)), atol=1e-6)
     assert acmdm.block_causal(8, 8, 8).all() and not acmdm.block_causal(8, 8, 4).all()
     np.testing.assert_array_equal(acmdm.block_causal(4, 8, 4), np.ones((4, 8)))
     np.testing.assert_array_equal(acmdm.block_causal(2, 2, 1), [[1, 0], [1, 1]])
@@ -209,10 +201,7 @@ def test_a_fresh_branch_changes_nothing_and_copies_the_blocks(control_pair):
     base, branch = control_pair
     told = condition((8, 6))
     np.testing.assert_array_equal(answer_with(base, branch, told, some_control()), answer(base, STATE, TIME, told))
-    for mine, its in zip(
-        jax.tree.leaves(nnx.state(branch.blocks)), jax.tree.leaves(nnx.state(base.blocks)), strict=True
-    ):
-        np.testing.assert_array_equal(mine, its)
+    assert same_tree(nnx.state(branch.blocks), nnx.state(base.blocks))
     assert np.abs(branch.text.kernel[...] - base.text.kernel[...]).max() > 0  # fresh
 
 
@@ -222,17 +211,13 @@ def test_a_trained_branch_hears_control_in_its_place_and_time(control_pair):
     told, control = condition(), some_control()
     first = answer_with(base, branch, told, control)
     assert np.abs(first - answer(base, STATE, TIME, told)).max() > 1e-3
-    for other in (
-        control.dropped(),
-        some_control(joint=4),
-        control._replace(positions=jnp.roll(control.positions, 4, 1)),
-    ):
+    later = control._replace(positions=jnp.roll(control.positions, 4, 1))
+    for other in (control.dropped(), some_control(joint=4), later):
         assert np.abs(answer_with(base, branch, told, other) - first).max() > 1e-4
     # Only positions are shown: what is not asked is zero, and a dropped control hides all of it.
-    hidden = control._replace(positions=7.0 * control.positions).dropped()
-    np.testing.assert_array_equal(
-        answer_with(base, branch, told, hidden), answer_with(base, branch, told, control.dropped())
-    )
+    other = control._replace(positions=7.0 * control.positions)
+    hidden, plain = (answer_with(base, branch, told, each.dropped()) for each in (other, control))
+    np.testing.assert_array_equal(hidden, plain)
     tokens = branch.control_tokens(control) - branch.control_tokens(control._replace(positions=0.0 * control.positions))
     patches = base.config.num_patches
     there = np.flatnonzero(np.abs(tokens[0]).max(axis=-1) > 1e-6)
@@ -306,5 +291,4 @@ def test_every_preset_of_acmdm_survives_json_and_is_counted():
     ],
 )
 def test_settings_that_make_no_sense_are_refused(family, settings, message):
-    with pytest.raises(ValueError, match=message):
-        config_of(family, **settings)
+    refused(message, config_of, family, **settings)

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from builders import refused, stirred
 from flax import nnx
 from scipy.special import erf
 
@@ -43,10 +44,8 @@ def plain_attention(query, key, value):
 
 
 def plain_multi_head(layer, asking, answering):
-    heads = lambda x: x.reshape(*x.shape[:2], layer.num_heads, -1)
-    query, key, value = (
-        heads(linear(part, x)) for part, x in ((layer.query, asking), (layer.key, answering), (layer.value, answering))
-    )
+    heads = lambda part, x: linear(part, x).reshape(*x.shape[:2], layer.num_heads, -1)
+    query, key, value = heads(layer.query, asking), heads(layer.key, answering), heads(layer.value, answering)
     return linear(layer.output, plain_attention(query, key, value).reshape(asking.shape))
 
 
@@ -58,13 +57,7 @@ def plain_norm(layer, x):
 
 def make_block(dropout=0.0):
     """A block whose every weight is random, biases and norms too."""
-    block = TransformerBlock(WIDTH, HEADS, HIDDEN, dropout, rngs=nnx.Rngs(params=0))
-    rng = np.random.default_rng(1)
-    nnx.update(
-        block,
-        jax.tree.map(lambda leaf: jnp.asarray(0.4 * rng.standard_normal(leaf.shape), leaf.dtype), nnx.state(block)),
-    )
-    return block
+    return stirred(TransformerBlock(WIDTH, HEADS, HIDDEN, dropout, rngs=nnx.Rngs(params=0)), scale=0.4)
 
 
 def test_position_code_by_hand():
@@ -122,8 +115,8 @@ def test_multi_head_attention_equals_a_plain_loop(num_heads):
 
 @pytest.mark.parametrize("num_heads", [0, 3])
 def test_heads_must_divide_the_width(num_heads):
-    with pytest.raises(ValueError, match=f"divide the width {WIDTH}, got {num_heads}"):
-        TransformerBlock(WIDTH, num_heads, HIDDEN, rngs=nnx.Rngs(params=0))
+    message = f"divide the width {WIDTH}, got {num_heads}"
+    refused(message, TransformerBlock, WIDTH, num_heads, HIDDEN, rngs=nnx.Rngs(params=0))
 
 
 def test_section_3_4_1_block_has_the_weights_of_an_encoder_layer():

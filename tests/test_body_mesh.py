@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from builders import SKELETON, wandering_motion
+from builders import SKELETON, refused, wandering_motion
 from scipy.spatial.transform import Rotation
 
 from f3amd_lib.motion import synthetic
@@ -33,8 +33,7 @@ def test_lists_have_their_sizes_begin_with_the_vertex_itself_and_reach_all():
     line = np.abs(np.subtract.outer(np.arange(5.0), np.arange(5.0)))
     lists = mesh_lists(line, (5, 3), (2,), (2,), (1,))
     assert lists.down[0].tolist() == [[0, 1], [4, 3], [2, 1]] and lists.up[0].ravel().tolist() == [0, 0, 2, 1, 1]
-    with pytest.raises(ValueError, match="levels begin with 6 vertices, the body has 5"):
-        mesh_lists(line, (6, 3), (2,), (2,), (1,))
+    refused("levels begin with 6 vertices, the body has 5", mesh_lists, line, (6, 3), (2,), (2,), (1,))
 
 
 def test_distances_go_along_the_body():

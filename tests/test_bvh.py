@@ -48,15 +48,9 @@ ARM_POSITIONS = np.array(
 )
 
 
-def body(*joints: str, rows: list[str], frame_time: str = "0.05") -> str:
+def body(*joints: str, rows: list[str]) -> str:
     """Return a BVH text: joint blocks inside one ROOT, then rows."""
-    return (
-        "HIERARCHY\n"
-        + "\n".join(joints)
-        + f"\nMOTION\nFrames: {len(rows)}\nFrame Time: {frame_time}\n"
-        + "\n".join(rows)
-        + "\n"
-    )
+    return "\n".join(["HIERARCHY", *joints, "MOTION", f"Frames: {len(rows)}", "Frame Time: 0.05", *rows, ""])
 
 
 def test_two_bone_arm_by_hand():
@@ -80,13 +74,8 @@ def test_each_joint_has_its_own_order_and_channels_may_be_mixed():
     motion = parse_bvh(text, "mixed")
     # An axis without a position channel keeps the OFFSET.
     np.testing.assert_allclose(motion.root_position, [[0.6, 0.02, 0.5]], atol=1e-12)
-    expected = [
-        matrix_from_euler("YX", [30, 40]),
-        matrix_from_euler("XZ", [50, 60]),
-        matrix_from_euler("Y", [70]),
-        np.eye(3),
-    ]
-    np.testing.assert_allclose(motion.rotations[0], expected, atol=1e-12)
+    turns = [matrix_from_euler(axes, angles) for axes, angles in (("YX", [30, 40]), ("XZ", [50, 60]), ("Y", [70]))]
+    np.testing.assert_allclose(motion.rotations[0], [*turns, np.eye(3)], atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -162,8 +151,7 @@ def stretching_bone(second: str) -> str:
 
 def test_bones_must_be_rigid():
     assert parse_bvh(stretching_bone("10.1"), "jitter").skeleton.offsets[1, 0] == pytest.approx(0.1005)
-    with pytest.raises(ValueError, match=r"rubber\.bvh, line 3: .*'Left' move.* 6\.0 mm .*rigid"):
-        parse_bvh(stretching_bone("11.2"), "rubber.bvh")
+    refused(r"rubber\.bvh, line 3: .*'Left' move.* 6\.0 mm .*rigid", parse_bvh, stretching_bone("11.2"), "rubber.bvh")
 
 
 def swap(old: str, new: str, count: int = 1):
@@ -179,22 +167,16 @@ BROKEN = {
     "truncated last frame": (lambda text: text[:-9], 26, "frame 1 has 8 numbers .* 12 .* cut off"),
     "NaN": (swap("-90", "nan"), 26, "'nan' .number 7 of frame 1, Zrotation of Elbow"),
     "too few frames": (swap("Frames: 2", "Frames: 3"), 23, "says 3, but 2 rows"),
-    "no frame rows": (lambda text: text[: text.index("100 50")], 23, "says 2, but 0 rows"),
     "no Frames line": (swap("Frames: 2\n", ""), 22, "'Frames: 120' and .* must follow"),
     "two ROOTs": (swap("}\n\nMOTION", "}\nROOT Twin\n{\n}\nMOTION"), 21, "second ROOT .*'Base' in l"),
     "brace too many": (swap("}\n\nMOTION", "}\n}\nMOTION"), 21, "'}' is outside"),
     "joint without brace": (swap("Elbow\n  {", "Elbow\n"), 6, "JOINT needs a name .* '{', found 'Elbow"),
-    "unknown channel": (
-        swap("Xrotation", "Wrotation"),
-        5,
-        "'Base' says it has 6 channels, but lists X.* Zrotation; each",
-    ),
+    "unknown channel": (swap("Xrotation", "Wrotation"), 5, "'Base' says it has 6 channels, but lists X.* Zrotation"),
     "channel twice": (swap("Yrotation\n  J", "Xrotation\n  J"), 5, "has 6 .* Xrotation, Xrotation; .* once"),
     "duplicate names": (swap("JOINT Wrist", "JOINT Elbow"), 10, "'Elbow' is taken .line 6"),
     "joint without name": (swap("JOINT Wrist", "JOINT"), 10, "needs a name"),
     "joint without OFFSET": (swap("    OFFSET 0 10 0\n", ""), 18, "'Elbow' ends without OFFSET"),
     "short OFFSET": (swap("OFFSET 0 10 0", "OFFSET 0 10"), 8, "OFFSET needs 3 .* CHANNELS'"),
-    "no MOTION": (swap("MOTION", "MOTIONS"), 27, "without a MOTION line"),
     "cut inside the hierarchy": (lambda text: text[:120], 6, "without a MOTION line"),
     "no HIERARCHY": (swap("HIERARCHY", "HELLO"), 1, "unexpected 'HELLO'; known here are HIERARCHY"),
     "odd bytes in a row": (lambda text: text.encode().replace(b"-90", b"\xff\xfe"), 26, "number 7"),
@@ -232,8 +214,9 @@ def random_motion(seed: int = 0, frames: int = 7) -> Motion:
     return Motion(skeleton, 20 * random.normal(size=(frames, 3)), matrix_from_euler("XYZ", angles), 30.0)
 
 
-def positions_by_name(motion: Motion) -> dict[str, np.ndarray]:
-    return {name: motion.positions[:, j] for j, name in enumerate(motion.skeleton.names)}
+def assert_same_positions(after: Motion, before: Motion) -> None:
+    order = [after.skeleton.names.index(name) for name in before.skeleton.names]
+    np.testing.assert_allclose(after.positions[:, order], before.positions, atol=1e-6)
 
 
 def test_write_and_read_again(tmp_path):
@@ -242,9 +225,7 @@ def test_write_and_read_again(tmp_path):
     assert again.fps == pytest.approx(30.0, rel=1e-8)
     assert again.skeleton.names == ("Hips", "Left", "Left Foot", "Right", "RightFoot")
     assert (2, (0.0, -0.1, 0.2)) in again.skeleton.end_sites
-    before, after = positions_by_name(motion), positions_by_name(again)
-    for name in before:
-        np.testing.assert_allclose(after[name], before[name], atol=1e-6)
+    assert_same_positions(again, motion)
     assert sorted(item.name for item in (tmp_path / "new").iterdir()) == ["walk.bvh"]
 
 
@@ -255,9 +236,7 @@ def test_gimbal_lock_survives_the_round_trip_in_silence():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         again = parse_bvh(format_bvh(motion), "locked")
-    before, after = positions_by_name(motion), positions_by_name(again)
-    for name in before:
-        np.testing.assert_allclose(after[name], before[name], atol=1e-6)
+    assert_same_positions(again, motion)
 
 
 def test_no_file_is_overwritten_unasked(tmp_path):

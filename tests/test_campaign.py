@@ -100,9 +100,8 @@ def test_a_recipe_with_a_batch_of_its_own_sees_as_many_windows_in_other_steps(pa
     prepared = PreparedData(packed, 32, 10)
     how = {"batch_size": 128, "folder": tmp_path, "progress": False}
     for each in (run, Run("F3AMD-FNO-96")):
-        assert list(run_campaign(prepared, PROFILE, snapshots=[(each, 10_240)], **how)) == [
-            (each.name, 10_240, "unfinished")
-        ]
+        legs = list(run_campaign(prepared, PROFILE, snapshots=[(each, 10_240)], **how))
+        assert legs == [(each.name, 10_240, "unfinished")]
     assert [(config.batch_size, steps) for config, steps in seen] == [(512, 20), (128, 80)]
 
 
@@ -125,8 +124,7 @@ def test_training_multiplies_in_the_precision_asked_for(packed, monkeypatch, tmp
 def test_an_unknown_precision_is_refused_before_anything_is_trained(packed, tmp_path):
     for precision, why in (("tf23", "tf23"), ("bfloat16", "bfloat16"), ("tf32", "for a GPU")):
         how = {"folder": tmp_path, "snapshots": [(SEEDED, 8)], "precision": precision}
-        with pytest.raises(ValueError, match=why):
-            next(run_campaign(PreparedData(packed, 32, 10), PROFILE, None, Protocol(STYLES), **how))
+        refused(why, next, run_campaign(PreparedData(packed, 32, 10), PROFILE, None, Protocol(STYLES), **how))
     assert not list(tmp_path.iterdir())
 
 

@@ -116,11 +116,8 @@ def test_mirrored_channels_show_the_mirrored_motion():
 
 def test_motion_that_is_shorter_than_a_window_or_not_finite_gives_none():
     positions = np.array(walk(seconds=59 / 30).positions)
-    assert module.side_by_side(module.classifier_frames(positions, SYNTHETIC_SKELETON), 60).shape == (
-        0,
-        60,
-        module.NUM_CHANNELS,
-    )
+    frames = module.classifier_frames(positions, SYNTHETIC_SKELETON)
+    assert module.side_by_side(frames, 60).shape == (0, 60, module.NUM_CHANNELS)
     positions[40, 3, 1] = np.nan
     refused("not finite at frame 40, joint 3$", module.classifier_frames, positions, SYNTHETIC_SKELETON)
     refused(r"positions must be \[\.\.\., 23, 3\]", module.classifier_frames, np.zeros((60, 24, 3)), SYNTHETIC_SKELETON)
@@ -167,9 +164,8 @@ def numpy_forward(network: module.StyleNetwork, windows: np.ndarray):
 def test_network_equals_its_layers_written_out(trained):
     """With batch statistics far from what they are at first, and features of both signs."""
     rng = np.random.default_rng(0)
-    statistics = jax.tree.map(
-        lambda leaf: jnp.asarray(rng.uniform(0.05, 0.5, leaf.shape), jnp.float32), trained.statistics
-    )
+    drawn = lambda leaf: jnp.asarray(rng.uniform(0.05, 0.5, leaf.shape), jnp.float32)
+    statistics = jax.tree.map(drawn, trained.statistics)
     windows = rng.normal(size=(4, WINDOW, module.NUM_CHANNELS)).astype(np.float32)
     features, scores = module._answers(CONFIG, trained.params, statistics, windows)
     network = module._network(CONFIG, trained.params, statistics)
@@ -267,12 +263,7 @@ def test_classifier_is_trained_once_for_each_data_and_recipe(packed, tmp_path, m
     first, origin = module.obtain_classifier(packed, profile, **BRIEF)
     assert origin == "trained now" and first.record["dataset_fingerprint"] == packed.fingerprint
     asked = []
-
-    def train_again(packed, **settings):
-        asked.append(settings)
-        return first
-
-    monkeypatch.setattr(module, "train_classifier", train_again)
+    monkeypatch.setattr(module, "train_classifier", lambda packed, **settings: asked.append(settings) or first)
     again, origin = module.obtain_classifier(packed, profile, **BRIEF)
     assert origin == "earlier run" and not asked
     assert same_tree(again.params, first.params)

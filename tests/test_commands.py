@@ -1,5 +1,6 @@
 """The command that measures each claim: it asks for all that the claim's rule looks up, and it runs at smoke size."""
 
+import dataclasses
 import itertools
 import re
 import shlex
@@ -49,27 +50,15 @@ def tables(run: str) -> dict[str, list[dict]]:
         return {"training_time": [named | figure | {"model": model} for model in measurements._TRAINED]}
     if command == "bench":
         candidates = [candidate for group in measurements.plan(what).values() for candidate in group]
-        rows = [
-            figure
-            | {
-                "model": one.model,
-                "window_frames": one.window_frames,
-                "steps": one.steps,
-                "framework": implementations.IMPLEMENTATIONS[one.way][0],
-                "device": "GPU" if what == "gpu" else "CPU",
-                "characters": one.characters,
-            }
-            for one in candidates
-        ]
+        rows = pd.DataFrame(map(dataclasses.asdict, candidates))
+        rows = rows.assign(framework=rows["way"].map(lambda way: implementations.IMPLEMENTATIONS[way][0]))
+        rows = rows.assign(device="GPU" if what == "gpu" else "CPU", **figure)
         keys = ["model", "window_frames", "steps", "framework", "device", "characters"]
-        return {"synthesis_time": pd.DataFrame(rows).drop_duplicates(keys).to_dict("records")}
+        return {"synthesis_time": rows.drop_duplicates(keys).to_dict("records")}
     units = {metric: unit for metric, (unit, _) in NINE_METRICS.items()}
     if what == "quality":
-        steps = {model: (4, 2, 1) if model == PUBLISHED_CAMDM else measure.STEPS for model in models}
-        named = [
-            {"model": model, "window_frames": window, "steps": count} for model in models for count in steps[model]
-        ]
-        named.append({"model": "real", "window_frames": window, "steps": 0})
+        steps = {model: (4, 2, 1) if model == PUBLISHED_CAMDM else measure.STEPS for model in models} | {"real": (0,)}
+        named = [{"model": one, "window_frames": window, "steps": n} for one, counts in steps.items() for n in counts]
         quality = [one | figure | {"metric": metric, "unit": unit} for one in named for metric, unit in units.items()]
         extra = [{**one, **figure, "metric": "IRD_excess", "unit": "cm"} for one in named]
         rounds = [
@@ -88,11 +77,10 @@ def tables(run: str) -> dict[str, list[dict]]:
         weighted = [row | {"recipe": "low-noise-weighting"} for row in queue if row["metric"] == "held_out_error"]
         return {command: queue + weighted}
     if what == "trained":
-        trained = {"windows": 1e9}
         walks = {"stepping_rate": 1.8, "joint_acceleration": 1.0, "slide_speed": 5.0, "floor_penetration": 0.0}
         named = [{"model": model, "window_frames": window} for model in ("real", *presets.PRESETS)]
         return {
-            "trained": [one | {"metric": metric, "value": value} for one in named for metric, value in trained.items()],
+            "trained": [one | {"metric": "windows", "value": 1e9} for one in named],
             "walking": [one | {"steps": 8 * (one["model"] != "real")} | walks for one in named],
         }
     if what == "foot_spectrum":
@@ -103,9 +91,8 @@ def tables(run: str) -> dict[str, list[dict]]:
         return {"corruptions": [figure | {"corruption": c, "strength": s, "metric": m} for c, s, m in rows]}
     if what == "noise_use":
         levels = {model: presets.find_preset(model).network.get("noise_levels") or measure.SIGMAS for model in models}
-        return {
-            "x0_by_sigma": [{"model": model, "sigma": s, "x0_error": 1.0} for model in models for s in levels[model]]
-        }
+        rows = [(model, sigma) for model in models for sigma in levels[model]]
+        return {"x0_by_sigma": [{"model": model, "sigma": sigma, "x0_error": 1.0} for model, sigma in rows]}
     if what == "gradient_norm":
         return {what: [figure | {"model": "F3AMD-FNO-96", "sigma": sigma} for sigma in measure.SIGMAS]}
     assert command == "claims", nearest_hint(what, measure.MEASUREMENTS)
@@ -158,9 +145,7 @@ def test_a_command_is_understood(run, monkeypatch):
     monkeypatch.setattr("f3amd_companion.terminal.check_there", lambda *paths: None)
     monkeypatch.setattr("f3amd_lib.training.pipeline.prepare", lambda profile, **how: profile)
     for name in measure.MEASUREMENTS:
-        note = lambda prepared, profile, models, name=name, **extra: (
-            called.append((name, profile.window, models, extra)) or "table"
-        )
+        note = lambda _, profile, models, name=name, **extra: called.append((name, profile.window, models, extra)) or ""
         monkeypatch.setitem(measure.MEASUREMENTS, name, note)
     monkeypatch.setattr(measurements, "measure_training_time", lambda _, profile, **__: called.append(profile.window))
     monkeypatch.setattr(measurements, "measure_synthesis_time", lambda *a, **k: called.append(a[2]) or 1 / 0)

@@ -1,11 +1,12 @@
 """Condition tokens, and the ways of c into a block, against plain numpy (3.3, 3.4.3, Table 11)."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from builders import stirred
 from compiled import Compiled
 from flax import nnx
+from test_attention import draw, linear
 
 from f3amd_lib.networks import conditioning
 from f3amd_lib.networks.attention import TransformerBlock, position_code
@@ -15,24 +16,8 @@ from f3amd_lib.networks.spectral import FNOBlock
 CHANNELS, STYLES, WIDTH, WINDOW, HISTORY = 9, 3, 8, 6, 4
 
 
-def draw(*shape, seed=0):
-    return np.random.default_rng(seed).standard_normal(shape).astype(np.float32)
-
-
 def silu(x):
     return x / (1.0 + np.exp(-x))
-
-
-def linear(layer, x):
-    return x @ np.asarray(layer.kernel[...]) + np.asarray(layer.bias[...])
-
-
-def randomise(module, seed=0):
-    """Replace every weight of a module, zero ones too, by a random number; return the module."""
-    rng = np.random.default_rng(seed)
-    state = jax.tree.map(lambda leaf: jnp.asarray(0.3 * rng.standard_normal(leaf.shape), leaf.dtype), nnx.state(module))
-    nnx.update(module, state)
-    return module
 
 
 def make_condition(batch=2, seed=0):
@@ -43,11 +28,10 @@ def make_condition(batch=2, seed=0):
     )
 
 
-def make_encoder(num_heads=1):
-    sizes = {"channels": CHANNELS, "num_styles": STYLES, "window": WINDOW, "num_history": HISTORY}
-    return conditioning.ConditionEncoder(
-        conditioning.ConditionedConfig(**sizes, latent_width=WIDTH), num_heads, rngs=nnx.Rngs(params=0)
-    )
+def make_encoder(num_heads=1, window=WINDOW):
+    sizes = {"channels": CHANNELS, "num_styles": STYLES, "num_history": HISTORY, "latent_width": WIDTH}
+    config = conditioning.ConditionedConfig(**sizes, window=window)
+    return conditioning.ConditionEncoder(config, num_heads, rngs=nnx.Rngs(params=0))
 
 
 def test_eq01_noise_features_by_hand():
@@ -108,11 +92,7 @@ def test_section_3_3_cross_attention_equals_a_plain_loop(num_heads):
 
 def test_a_path_row_counts_at_its_own_frame_of_a_window_of_64():
     """The paper's row of frame t moved to t + 32, with as many others between, is another question."""
-    sizes = {"channels": CHANNELS, "num_styles": STYLES, "window": 64, "num_history": HISTORY}
-    encoder = conditioning.ConditionEncoder(
-        conditioning.ConditionedConfig(**sizes, latent_width=WIDTH), 1, rngs=nnx.Rngs(params=0)
-    )
-    moved = {}
+    encoder, moved = make_encoder(window=64), {}
     for frame in (5, 37):
         path = np.zeros((1, 64, 8), np.float32)
         path[:, frame] = 3.0
@@ -121,7 +101,7 @@ def test_a_path_row_counts_at_its_own_frame_of_a_window_of_64():
 
 
 def test_eq05_to_eq07_equal_plain_numpy():
-    film = randomise(conditioning.FiLM(WIDTH, 5, rngs=nnx.Rngs(params=0)))
+    film = stirred(conditioning.FiLM(WIDTH, 5, rngs=nnx.Rngs(params=0)))
     z, c = draw(2, WINDOW, WIDTH), draw(2, WINDOW, 5, seed=1)
     mixed = linear(film.modulation, c)
     gamma, beta = mixed[..., :WIDTH], mixed[..., WIDTH:]
@@ -150,7 +130,7 @@ def test_table_11_adaln_zero_starts_as_the_identity(kind):
 
 
 def test_table_11_adaln_zero_equals_plain_numpy():
-    layer = randomise(conditioning.AdaLNZero(WIDTH, 5, rngs=nnx.Rngs(params=0)))
+    layer = stirred(conditioning.AdaLNZero(WIDTH, 5, rngs=nnx.Rngs(params=0)))
     z, c = 3.0 * draw(2, WINDOW, WIDTH) + 1.0, draw(2, WINDOW, 5, seed=1)
     shift, scale, gate = np.split(linear(layer.modulation, c), 3, axis=-1)
     centred = z - z.mean(axis=-1, keepdims=True)
@@ -161,7 +141,7 @@ def test_table_11_adaln_zero_equals_plain_numpy():
 
 @pytest.mark.parametrize("num_heads", [1, 2])
 def test_table_11_cross_attention_is_added_to_the_base_block(num_heads):
-    layer = randomise(conditioning.CrossAttention(WIDTH, 5, num_heads, rngs=nnx.Rngs(params=0)))
+    layer = stirred(conditioning.CrossAttention(WIDTH, 5, num_heads, rngs=nnx.Rngs(params=0)))
     z, c = draw(2, WINDOW, WIDTH), draw(2, WINDOW, 5, seed=1)
     z_base, code = np.sin(z), position_code(0, WINDOW, WIDTH).astype(np.float32)
     z_tilde = z_base + np.asarray(layer.attention(z_base + code, c))
@@ -170,7 +150,7 @@ def test_table_11_cross_attention_is_added_to_the_base_block(num_heads):
 
 
 def test_table_11_concatenation_is_the_base_block_and_the_output_layer():
-    layer = randomise(Concatenation(WIDTH, rngs=nnx.Rngs(params=0)))
+    layer = stirred(Concatenation(WIDTH, rngs=nnx.Rngs(params=0)))
     z, c = draw(2, 2 * WINDOW, WIDTH), draw(2, WINDOW, WIDTH, seed=1)
     expected = silu(linear(layer.output, np.sin(z)))
     np.testing.assert_allclose(Compiled(layer)(jnp.sin, z, c), expected, atol=1e-5)

@@ -6,6 +6,7 @@ import json
 
 import pandas as pd
 import pytest
+from builders import refused
 from f3amd_notebooks import equation_map as map_module
 from f3amd_notebooks.equation_map import mentioned_equations
 from f3amd_notebooks.readings import fill_reading, readings_table
@@ -43,14 +44,8 @@ def files_are_read_once():
     ],
 )
 def test_mentions_are_read(text, expected):
-    assert known_mentions(text) == expected
-
-
-def known_mentions(text, paper="f3amd"):
-    """Labels of a paper's equations that a text mentions."""
-    return {label for folder, label in map_module.mentioned_equations(text) if folder == paper} & set(
-        map_module.equation_labels(paper)
-    )
+    mentioned = {label for folder, label in mentioned_equations(text) if folder == "f3amd"}
+    assert mentioned & set(map_module.equation_labels("f3amd")) == expected
 
 
 def write_notebook(path, *cells):
@@ -100,18 +95,12 @@ def test_the_map_points_to_sections_and_their_figures(tmp_path):
     assert rows.loc["alpha_t", "notebooks"] == ""
 
 
-@pytest.fixture(scope="module")
-def whole_map():
-    """The map of this checkout."""
-    return map_module.equation_map()
-
-
-@pytest.mark.parametrize("column", ["functions", "tests", "notebooks", "cells", "figures"])
-def test_every_equation_of_the_paper_has_an_entry_in_every_column(whole_map, column):
-    assert len(whole_map) == 16 and whole_map.loc[whole_map[column] == "", "equation"].tolist() == []
-    row = whole_map.set_index("equation").loc["Eq. 9"]
-    place = {"functions": "diffusion/schedules: variance_exploding", "cells": "2.3", "figures": "02_schedule"}
-    assert place.get(column, "") in row[column]
+def test_every_equation_of_the_paper_has_an_entry_in_every_column():
+    table = map_module.equation_map().set_index("equation")
+    assert len(table) == 16 and (table[["functions", "tests", "notebooks", "cells", "figures"]] != "").all(axis=None)
+    found = table.loc["Eq. 9"]
+    assert "diffusion/schedules: variance_exploding" in found.functions
+    assert "2.3" in found.cells and "02_schedule" in found.figures
 
 
 # --------------------------------------------------------------------------------------------- the page, and all papers
@@ -131,8 +120,7 @@ def test_the_committed_page_is_what_the_code_says():
     page = (repository_root() / "docs/equations.md").read_text(encoding="utf-8")
     assert page == map_module.equations_markdown(), "write it again: python -m f3amd_notebooks.equation_map"
     for paper in papers.paper_folders():
-        about = papers.load_paper_file("paper", paper)
-        table = page.split(f"## {about['name']}\n")[1].split("\n## ")[0]
+        table = page.split(f"## {papers.load_paper_file('paper', paper)['name']}\n")[1].split("\n## ")[0]
         assert [line.split(" | ")[0][2:] for line in table.splitlines()[3:]] == map_module.equation_labels(paper)
 
 
@@ -171,8 +159,7 @@ def test_open_points_show_the_codes_own_defaults():
     assert table["scale of the noisy input"].startswith("input_scaling = True")
     assert not table.str.contains("{", regex=False).any()
     assert set(readings_table("data")["topic"]) == {"data"}
-    with pytest.raises(ValueError, match="unknown topic"):
-        readings_table("weather")
+    refused("unknown topic", readings_table, "weather")
 
 
 CONFIGS = {"F3AMDConfig": "f3amd_lib.networks.f3amd:F3AMDConfig"}
@@ -187,11 +174,9 @@ READING = {"topic": "data", "point": "noise", "paper": "not said", "here": "{}",
     ],
 )
 def test_a_broken_open_point_is_refused(changes, message):
-    with pytest.raises(ValueError, match=f"f.toml, 'noise': .*{message}"):
-        fill_reading(READING | changes, "f.toml", CONFIGS)
-    assert fill_reading(READING | {"field": "F3AMDConfig.dropout"}, "f.toml", CONFIGS) == str(
-        F3AMDConfig(channels=1, num_styles=1).dropout
-    )
+    refused(f"f.toml, 'noise': .*{message}", fill_reading, READING | changes, "f.toml", CONFIGS)
+    known = fill_reading(READING | {"field": "F3AMDConfig.dropout"}, "f.toml", CONFIGS)
+    assert known == str(F3AMDConfig(channels=1, num_styles=1).dropout)
 
 
 @pytest.mark.parametrize(

@@ -66,9 +66,8 @@ def toy(honest: bool, pairs=4, clips=64, seed=0) -> text_judge.EvaluatorTask:
     words = generator.normal(size=(pairs, 3, 6))
     tokens = (words[told] + 0.1 * generator.normal(size=(2 * clips, 3, 6))).astype(np.float32)
     captions = text_judge.Captions(*map(jnp.asarray, (tokens, np.ones((2 * clips, 3), bool), np.repeat(kind, 2))))
-    return text_judge.EvaluatorTask(
-        SMALL, text_judge.EvaluatorTraining(100, 16, 3e-3, seed, num_frames=48), table, captions, "toy"
-    )
+    training = text_judge.EvaluatorTraining(100, 16, 3e-3, seed, num_frames=48)
+    return text_judge.EvaluatorTask(SMALL, training, table, captions, "toy")
 
 
 def test_a_batch_carries_the_captions_of_its_clips():

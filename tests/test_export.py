@@ -149,9 +149,8 @@ def test_an_artefact_runs_without_the_library(runtime, request, tmp_path, jit_ro
     refused = ("f3amd_lib", "f3amd_companion", "flax") + (("jax",) if runtime == "iree" else ())
     script = _ALONE.format(refused=refused, folder=str(folder), runtime=runtime)
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
-    done = subprocess.run(
-        [sys.executable, "-c", script], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
-    )
+    how = {"cwd": tmp_path, "env": environment, "capture_output": True, "text": True}
+    done = subprocess.run([sys.executable, "-c", script], **how)
     assert done.returncode == 0, done.stderr
     shapes = {item: tuple(shape) for item, shape in load_shapes(folder).items()}
     np.testing.assert_allclose(np.load(tmp_path / "answer.npy"), jit_round(*inputs_of(shapes, 11)), atol=1e-3)
@@ -195,7 +194,6 @@ def test_a_file_cut_short_or_altered_is_refused(jax_folder, tmp_path):
     content = (copy / file).read_bytes()
     (copy / file).write_bytes(content[:-1])
     refused(f"{file}: content does not match its checksum", load_artefact, copy, runtime="jax")
-    refused(f"{file}: content does not match its checksum", load_artefact, copy, runtime="jax")
     (copy / file).unlink()
     refused(f"{file}: is missing, although manifest.json lists this file", load_artefact, copy, runtime="jax")
 
@@ -223,12 +221,9 @@ def test_an_artefact_of_another_machine_is_refused(iree_folder, tmp_path):
     def other_cpu(manifest):
         manifest["targets"]["llvm-cpu"]["cpu"]["features"].append("imaginary")
 
-    for number, (alter, message) in enumerate(
-        (
-            (change(iree_version="2.0.0"), r"compiled by IREE 2\.0\.0, .*iree-base-runtime==2\.0"),
-            (other_cpu, "another CPU.* lacks imaginary: compile it here"),
-        )
-    ):
+    other_iree = change(iree_version="2.0.0"), r"compiled by IREE 2\.0\.0, .*iree-base-runtime==2\.0"
+    cases = other_iree, (other_cpu, "another CPU.* lacks imaginary: compile it here")
+    for number, (alter, message) in enumerate(cases):
         copy = altered(iree_folder, tmp_path / str(number), alter)
         refused(message, load_artefact, copy)
     refused("no program for target 'vmvx' .*there are llvm-cpu", load_artefact, iree_folder, target="vmvx")
@@ -252,8 +247,8 @@ def test_a_trained_model_is_exported_with_its_own_schedule(trained, tmp_path):
     manifest = load_artefact(folder, runtime="jax").manifest
     assert manifest["sigmas"] == trained.diffusion.grid(1).tolist()
     assert (manifest["sampler"], manifest["batch"], manifest["num_steps"]) == ("ddim", 3, 1)
-    with pytest.raises(ValueError, match="unknown target 'lvm-cpu'; did you mean 'llvm-cpu'"):
-        export_model(trained, tmp_path / "new", targets=("lvm-cpu",))
+    message = "unknown target 'lvm-cpu'; did you mean 'llvm-cpu'"
+    refused(message, export_model, trained, tmp_path / "new", targets=("lvm-cpu",))
     assert not (tmp_path / "new").exists()
 
 

@@ -44,9 +44,8 @@ def run(network, x_noisy, sigma=SIGMA, condition=None):
     return evaluate(network, x_noisy, sigma, condition)
 
 
-OPTIONS = {
-    field.name: field.default for field in dataclasses.fields(VariantConfig)[len(dataclasses.fields(F3AMDConfig)) :]
-}
+OWN = dataclasses.fields(VariantConfig)[len(dataclasses.fields(F3AMDConfig)) :]
+OPTIONS = {field.name: field.default for field in OWN}
 
 
 @pytest.mark.parametrize("option", OPTIONS)
@@ -100,12 +99,9 @@ def test_section_4_5_all_modes_there_are_unless_told(changes, modes):
 
 def test_wrong_shapes_are_refused_by_name():
     network, condition = make_network(), make_condition()
-    for name, wrong in (
-        ("history", draw(2, HISTORY + 1, CHANNELS)),
-        ("path", draw(2, WINDOW, 7)),
-        ("style", draw(2, 3)),
-    ):
-        refused(f"condition {name} must have shape", network.encode, condition._replace(**{name: wrong}))
+    wrong = {"history": draw(2, HISTORY + 1, CHANNELS), "path": draw(2, WINDOW, 7), "style": draw(2, 3)}
+    for name, part in wrong.items():
+        refused(f"condition {name} must have shape", network.encode, condition._replace(**{name: part}))
     refused(rf"\[B, {WINDOW}, {CHANNELS}\]", run, network, draw(2, WINDOW + 1, CHANNELS), condition=condition)
 
 
@@ -219,11 +215,9 @@ def test_section_3_4_1_transformer_blocks_see_the_order_of_frames():
     np.testing.assert_allclose(stages["block 1"], block, atol=1e-5)
 
 
-def test_output_scaling_is_the_skip_of_karras(monkeypatch):
+def test_output_scaling_is_the_skip_of_karras():
     """Karras et al. 2022, Table 1: c_skip x + c_out F with sigma_data."""
-    settings = {"sigma_data": 0.5}
-    scaled = make_network(output_scaling=True, **settings)
-    plain = make_network(**settings)
+    scaled, plain = make_network(output_scaling=True, sigma_data=0.5), make_network(sigma_data=0.5)
     x_noisy, sigma = draw(2, WINDOW, CHANNELS), np.array([0.3, 20.0])[:, None, None]
     total = sigma**2 + 0.25
     expected = 0.25 / total * x_noisy + sigma * 0.5 / np.sqrt(total) * run(plain, x_noisy)
@@ -286,8 +280,7 @@ def test_pre_norm_is_what_a_block_reads(base_block):
 
 def lively_network(**changes):
     """A network whose every path is open: residual blocks start closed, with an output of zero."""
-    network = make_network(**changes)
-    return stirred(network, 5, scale=0.05)
+    return stirred(make_network(**changes), 5, scale=0.05)
 
 
 def a_walk(yaw):
@@ -309,9 +302,8 @@ def a_walk(yaw):
 @pytest.mark.parametrize("facing_frame", [True, False])
 def test_a_network_that_faces_its_path_is_the_same_for_every_heading(facing_frame):
     network = lively_network(facing_frame=facing_frame, history_anchor=True, residual_prior=True, normalise=False)
-    still, turned = np.zeros(2), np.array([0.7, -2.5])
     answers = []
-    for yaw in (still, turned):
+    for yaw in (np.zeros(2), np.array([0.7, -2.5])):
         x_noisy, condition = a_walk(yaw)
         x0_hat = np.asarray(run(network, x_noisy, condition=condition))
         answers.append(turn_frames(x0_hat, -yaw))

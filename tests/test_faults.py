@@ -16,10 +16,7 @@ def listed():
     return faults.read_faults()
 
 
-def test_there_are_faults_of_every_kind(listed):
-    assert len(listed) >= 180
-    areas = {fault.area for fault in listed}
-    assert {"formulas", "wiring", "data splits", "records", "ledger", "text to motion", "readers"} <= areas
+def test_a_fault_changes_its_place_and_names_test_files_that_are_there(listed):
     for fault in listed:
         assert fault.old != fault.new and fault.old.strip()
         files = [word for word in fault.tests if word.endswith(".py")]

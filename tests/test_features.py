@@ -68,9 +68,8 @@ def test_centring_by_hand():
 
 def test_turning_frames_is_turning_the_motion():
     motion = wandering_motion(10)
-    np.testing.assert_allclose(
-        features.turn_frames(features.world_frames(motion), 0.8), features.world_frames(turn(motion, 0.8)), atol=1e-12
-    )
+    turned = features.turn_frames(features.world_frames(motion), 0.8)
+    np.testing.assert_allclose(turned, features.world_frames(turn(motion, 0.8)), atol=1e-12)
 
 
 def test_orthonormalise_leaves_rotations_and_mends_the_rest():
@@ -84,9 +83,7 @@ def test_orthonormalise_leaves_rotations_and_mends_the_rest():
         np.testing.assert_allclose(np.linalg.norm(vector, axis=-1), 1.0, atol=1e-12)
     np.testing.assert_allclose((first * second).sum(-1), 0.0, atol=1e-12)
     # The pose that kinematics sees does not change.
-    np.testing.assert_allclose(
-        features.frame_positions(SKELETON, mended), features.frame_positions(SKELETON, noisy), atol=1e-12
-    )
+    np.testing.assert_allclose(*(features.frame_positions(SKELETON, each) for each in (mended, noisy)), atol=1e-12)
     np.testing.assert_allclose(features.orthonormalise(mended), mended, atol=1e-12)
 
 

@@ -140,9 +140,8 @@ def modules_after(script: str) -> list[str]:
 
 def test_the_core_runs_without_the_rest():
     """Every module of the core in a fresh process: no wing, no companion, nothing that serves, exports or prints."""
-    names = [
-        name for name in modules() if name.startswith("f3amd_lib") and not f"{name}.".startswith("f3amd_lib.text.")
-    ]
+    wing = "f3amd_lib.text."
+    names = [name for name in modules() if name.startswith("f3amd_lib") and not f"{name}.".startswith(wing)]
     refused = ("f3amd_companion", "f3amd_notebooks", *FOREIGN)
     loaded = "[name for name in sys.modules if name.split('.')[0] in {} or name.startswith('f3amd_lib.text')]"
     load = f"import importlib\nfor name in {names!r}:\n    importlib.import_module(name)\n"

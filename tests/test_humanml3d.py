@@ -5,6 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
+from builders import refused
 
 from f3amd_companion.__main__ import main
 from f3amd_lib.data.sources import open_dataset
@@ -136,8 +137,7 @@ def test_more_than_a_fifth_broken_or_nothing_left_is_refused(tmp_path, breaking,
     (tmp_path / "new_joints/000004.npy").unlink()
     (tmp_path / "new_joint_vecs/000004.npy").unlink()
     breaking(tmp_path)
-    with pytest.raises(ValueError, match=words):
-        humanml3d.read_humanml3d(tmp_path)
+    refused(words, humanml3d.read_humanml3d, tmp_path)
 
 
 def test_a_folder_of_windows_with_vectors_alone_gives_the_same_positions(tmp_path):
@@ -199,12 +199,8 @@ def bvh_folder(tmp_path_factory):
 
 def test_bvh_files_with_a_table_become_a_data_set(bvh_folder, tmp_path, caplog):
     out = tmp_path / "made"
-    assert (
-        main(
-            ["dataset", "--source", str(bvh_folder), "--captions", str(bvh_folder / "captions.csv"), "--out", str(out)]
-        )
-        == 0
-    )
+    words = ["dataset", "--source", bvh_folder, "--captions", bvh_folder / "captions.csv", "--out", out]
+    assert main(list(map(str, words))) == 0
     data = humanml3d.read_humanml3d(out)
     assert data.skeleton == synthetic.synthesize(synthetic.STYLES[0], seconds=2.0, seed=0).skeleton and data.fps == 20.0
     # The one whose caption names a side has no mirrored twin.
@@ -230,6 +226,11 @@ def test_bvh_files_with_a_table_become_a_data_set(bvh_folder, tmp_path, caplog):
     assert data.licence == "as its owner says"
 
 
+def captioned(folder, captions) -> TextMotions:
+    """The motions of a folder with these captions by name."""
+    return captioned_folder.captioned_motions(open_dataset("folder", path=folder), captions)
+
+
 @pytest.mark.parametrize(
     "table, words",
     [
@@ -241,34 +242,21 @@ def test_bvh_files_with_a_table_become_a_data_set(bvh_folder, tmp_path, caplog):
 def test_a_bad_table_is_refused(bvh_folder, tmp_path, table, words):
     path = tmp_path / "bad.csv"
     path.write_text(table, encoding="utf-8")
-    with pytest.raises(ValueError, match=words):
-        captioned_folder.captioned_motions(
-            open_dataset("folder", path=bvh_folder), captioned_folder.read_caption_table(path)
-        )
+    refused(words, lambda: captioned(bvh_folder, captioned_folder.read_caption_table(path)))
 
 
 def test_what_a_mirror_shows_otherwise_is_not_mirrored_and_empty_splits_are_said(bvh_folder, caplog):
-    said = {
-        "take0": "a circle clockwise",
-        "take1": "turns Left",
-        "take2": "spins counter-clockwise",
-        "take3": "a leftover",
-    }
-    captions = {name: (caption,) for name, caption in said.items()}
-    made = captioned_folder.captioned_motions(open_dataset("folder", path=bvh_folder), captions)
-    assert sorted(made.names) == sorted(said) and "no clip for" not in caplog.text
-    few = captioned_folder.captioned_motions(open_dataset("folder", path=bvh_folder), {"take0": ("a walk",)})
+    said = ("a circle clockwise", "turns Left", "spins counter-clockwise", "a leftover")
+    captions = {f"take{number}": (caption,) for number, caption in enumerate(said)}
+    assert sorted(captioned(bvh_folder, captions).names) == sorted(captions) and "no clip for" not in caplog.text
+    few = captioned(bvh_folder, {"take0": ("a walk",)})
     assert few.names == ("take0", "Mtake0") and "no clip for validation and test" in caplog.text
 
 
 def test_nothing_is_written_over(bvh_folder, tmp_path):
-    data = captioned_folder.captioned_motions(
-        open_dataset("folder", path=bvh_folder), {"take0": ("a walk",), "take1": ("a walk",)}
-    )
-    assert isinstance(data, TextMotions)
+    data = captioned(bvh_folder, {"take0": ("a walk",), "take1": ("a walk",)})
     (tmp_path / "mine.txt").write_text("mine")
-    with pytest.raises(ValueError, match="is not empty; choose another folder"):
-        captioned_folder.write_humanml3d(tmp_path, data)
+    refused("is not empty; choose another folder", captioned_folder.write_humanml3d, tmp_path, data)
 
 
 @pytest.mark.slow
@@ -294,9 +282,7 @@ def test_a_folder_with_ten_broken_records_of_sixty_trains(tmp_path, caplog):
 
 
 def test_caption_lines_are_read_as_they_were_written():
-    line = captioned_folder.write_caption_line("A man's self-assured walk, twice.")
-    assert (
-        line
-        == "A man's self-assured walk, twice.#a/OTHER man's/OTHER self-assured/OTHER walk/OTHER twice/OTHER#0.0#0.0"
-    )
-    assert humanml3d.read_caption_line(line, "here") == ("A man's self-assured walk, twice.", 0.0, 0.0)
+    said = "A man's self-assured walk, twice."
+    line = captioned_folder.write_caption_line(said)
+    assert line == f"{said}#a/OTHER man's/OTHER self-assured/OTHER walk/OTHER twice/OTHER#0.0#0.0"
+    assert humanml3d.read_caption_line(line, "here") == (said, 0.0, 0.0)

@@ -59,10 +59,8 @@ def data(folder: Path) -> list[str]:
     """Pack a data set: the cache."""
     opened = sources.open_dataset
     sources.open_dataset = lambda name, **settings: opened(name, seconds_per_style=13.0, num_styles=1)
-    command_line.Data.open = lambda self: (
-        SimpleNamespace(packed=packed_dataset(sources.open_dataset(self.data), progress=False)),
-        None,
-    )
+    packed = lambda name: packed_dataset(sources.open_dataset(name), progress=False)
+    command_line.Data.open = lambda self: (SimpleNamespace(packed=packed(self.data)), None)
     return ["data"]
 
 
@@ -82,11 +80,12 @@ def _small_networks() -> None:
     build, prepared = presets.build_config, PreparedData(tiny_packed(), WINDOW, HISTORY)
     presets.build_config = lambda *a, **k: build(*a, **{**k, "depth": 1, "latent_width": 8})
     profiles.load_profile = lambda *a, **k: dataclasses.replace(load_profile(*a, **k), window=WINDOW)
-    given = lambda values: {name: value for name, value in values.items() if value is not None}
-    command_line.Data.open = lambda self, **values: (
-        prepared,
-        profiles.load_profile(self.profile, self.data, **given(values)),
-    )
+
+    def opened(self, **values):
+        given = {name: value for name, value in values.items() if value is not None}
+        return prepared, profiles.load_profile(self.profile, self.data, **given)
+
+    command_line.Data.open = opened
 
 
 def train(folder: Path) -> list[str]:
@@ -195,9 +194,8 @@ def start(tmp_path_factory):
         return process, ours
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv(
-            "PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), str(Path(command_line.__file__).parents[1])])
-        )
+        folders = Path(__file__).parent, Path(command_line.__file__).parents[1]
+        patch.setenv("PYTHONPATH", os.pathsep.join(map(str, folders)))
         patch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path_factory.mktemp("programs")))
         patch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
         yield start
@@ -223,10 +221,8 @@ def left(folder: Path) -> dict[str, object]:
         if not path.is_file() or ".part" in name or path.suffix == ".lock" or ".old" in name:
             continue
         if path.suffix == ".json":
-            circumstances = ("date_utc", "git_commit", "git_dirty")
-            found[name] = {
-                key: value for key, value in json.loads(path.read_text()).items() if key not in circumstances
-            }
+            circumstances, record = ("date_utc", "git_commit", "git_dirty"), json.loads(path.read_text())
+            found[name] = {key: value for key, value in record.items() if key not in circumstances}
         elif path.suffix == ".safetensors":
             found[name] = {key: array.tobytes() for key, array in load_file(path).items()}
         else:

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from builders import refused, same_tree
 from compiled import Compiled
 from test_text_judge import OneVectorAWord
 
@@ -67,19 +68,18 @@ def test_motionpcms_files_are_not_taken_for_acmdms(tmp_path, monkeypatch):
     monkeypatch.setattr(text_models, "text_model_folders", lambda _: [tmp_path / "none", tmp_path / "text"])
     for asked in ("motionpcm", "MotionPCM-M1-small"):
         assert text_models.find_text_model("bandai", asked) == tmp_path / "text" / "MotionPCM-M1-small.safetensors"
-    with pytest.raises(ValueError, match="no trained MotionPCM-M4-small .* f3amd train --preset MotionPCM-M4-small"):
-        text_models.find_text_model("bandai", "MotionPCM-M4-small")
+    message = "no trained MotionPCM-M4-small .* f3amd train --preset MotionPCM-M4-small"
+    refused(message, text_models.find_text_model, "bandai", "MotionPCM-M4-small")
     # A student is trained for one number of steps: the steps that are asked for choose it.
     for steps, wanted in ((None, "M1"), (1, "M1"), (2, "M2"), (4, "M4")):
         name = text_models.named_model("MotionPCM", steps)
         assert name == f"MotionPCM-{wanted}-small"
         assert presets.find_preset(name).training.get("num_phases", 1) == (steps or 1)
     assert text_models.named_model("MotionPCM-M1-small", 4) == "MotionPCM-M1-small"
-    with pytest.raises(ValueError, match="no trained MotionPCM-M2-small"):
-        text_models.find_text_model("bandai", "motionpcm", num_steps=2)
+    refused("no trained MotionPCM-M2-small", text_models.find_text_model, "bandai", "motionpcm", num_steps=2)
     for steps in (3, 50):
-        with pytest.raises(ValueError, match=f"for 1, 2 or 4 steps, none for {steps}; .* MotionPCM-teacher-small"):
-            text_models.find_text_model("bandai", "motionpcm", num_steps=steps)
+        message = f"for 1, 2 or 4 steps, none for {steps}; .* MotionPCM-teacher-small"
+        refused(message, text_models.find_text_model, "bandai", "motionpcm", num_steps=steps)
     assert text_models.is_latent_preset("MotionPCM (1-step)") and not text_models.is_latent_preset("ACMDM-S-PS22")
 
 
@@ -119,17 +119,16 @@ def test_the_command_asks_the_shipped_student_once_with_its_own_weights_key_and_
 
 
 def test_a_student_is_told_no_guidance_that_it_has_never_heard():
-    student, teacher = (
-        text_models.load_text_model(SHIPPED / f"MotionPCM-{name}-small.safetensors") for name in ("M1", "teacher")
-    )
+    files = (SHIPPED / f"MotionPCM-{name}-small.safetensors" for name in ("M1", "teacher"))
+    student, teacher = map(text_models.load_text_model, files)
     assert [guidance_of(student, 1, w) for w in (None, 5.0, 15.0)] == [14.0, 5.0, 15.0]
     assert [guidance_of(teacher, 50, w) for w in (None, 0.0, 20.0)] == [6.5, 0.0, 20.0]
     told = {**student.record["identity"]["training"], "consistency": "latent"}
     latent = dataclasses.replace(student, record={"identity": {"training": told}})
     assert [guidance_of(latent, steps) for steps in (1, 2, 4)] == [7.0, 11.5, 12.5]
     for w in (0.0, 4.9, 15.1):
-        with pytest.raises(ValueError, match="MotionPCM-M1-small was trained with a guidance of 5 to 15, got"):
-            latent_motions(student, np.zeros((1, 256), np.float32), 24, jax.random.key(0), guidance=w)
+        message, text = "MotionPCM-M1-small was trained with a guidance of 5 to 15, got", np.zeros((1, 256), np.float32)
+        refused(message, latent_motions, student, text, 24, jax.random.key(0), guidance=w)
 
 
 @pytest.fixture
@@ -233,9 +232,8 @@ def test_a_teacher_is_guided_away_from_what_its_encoder_makes_of_no_words(data, 
     again = text_models.load_text_model(text_models.text_model_files(PROFILE, "tiny-teacher", folder=tmp_path).model)
     network, text, noise = made.network(), np.full((1, 8), 0.5), jax.random.normal(jax.random.key(0), (1, 2, 3))
     network.output.kernel[...] = jax.random.normal(jax.random.key(1), network.output.kernel.shape)
-    by_hand, zeros = (
-        sample_teacher(network, made.schedule, text, empty, noise, num_steps=2) for empty in (np.ones(8), np.zeros(8))
-    )
+    walk = lambda empty: sample_teacher(network, made.schedule, text, empty, noise, num_steps=2)
+    by_hand, zeros = walk(np.ones(8)), walk(np.zeros(8))
     for model in (made, again):
         walked = motionpcm_sampling.latent_walk(model, 2)(network, text, noise, None)
         np.testing.assert_array_equal(walked, by_hand)
@@ -247,14 +245,9 @@ def test_a_student_is_trained_by_name_with_all_before_it(data, tmp_path, monkeyp
     made = train_stage.train_stage(data, OneVectorAWord(), PROFILE, "tiny-M2", folder=tmp_path, **QUIET)
     files = {name: text_models.text_model_files(PROFILE, name, folder=tmp_path).model for name in TINY}
     teacher, student = (text_models.load_text_model(files[name]) for name in ("tiny-teacher", "tiny-M2"))
-    assert (
-        text_models.load_text_model(files["tiny-VAE"]).config is None and made.text_encoder == OneVectorAWord.identity
-    )
-    for model in (teacher, student):
-        for found, wanted in zip(
-            *map(jax.tree.leaves, (model.autoencoder_params, made.autoencoder_params)), strict=True
-        ):
-            np.testing.assert_array_equal(found, wanted)
+    assert text_models.load_text_model(files["tiny-VAE"]).config is None
+    assert made.text_encoder == OneVectorAWord.identity
+    assert all(same_tree(model.autoencoder_params, made.autoencoder_params) for model in (teacher, student))
     assert (teacher.config.guidance_features, student.config.guidance_features) == (0, 256)
     assert student.record["identity"]["training"]["num_phases"] == 2
     # Held-out losses of each stage lie in its history, the discriminator's among the student's.
@@ -265,17 +258,15 @@ def test_a_student_is_trained_by_name_with_all_before_it(data, tmp_path, monkeyp
     elsewhere = tmp_path / "elsewhere"
     from_file = partial(train_stage.train_stage, data, OneVectorAWord(), PROFILE, folder=elsewhere, **QUIET)
     alone = from_file("tiny-M2", teacher=files["tiny-teacher"])
-    assert all((a == b).all() for a, b in zip(*map(jax.tree.leaves, (alone.params, made.params)), strict=True))
+    assert same_tree(alone.params, made.params)
     assert sorted(path.name.split(".")[0] for path in elsewhere.glob("*.safetensors")) == ["tiny-M2"] * 2
     for name, file, reason in (
         ("tiny-VAE", "tiny-teacher", "tiny-VAE needs no earlier model"),
         ("tiny-M2", "tiny-VAE", "holds tiny-VAE, and tiny-M2 needs tiny-teacher"),
     ):
-        with pytest.raises(ValueError, match=reason):
-            from_file(name, teacher=files[file])
-    others = data.select(np.arange(len(data.captions) - 1))
-    with pytest.raises(ValueError, match="trained on other clips"):
-        train_stage.train_stage(others, OneVectorAWord(), PROFILE, "tiny-M2", teacher=files["tiny-teacher"])
+        refused(reason, from_file, name, teacher=files[file])
+    others = data.select(np.arange(len(data.captions) - 1)), OneVectorAWord(), PROFILE, "tiny-M2"
+    refused("trained on other clips", train_stage.train_stage, *others, teacher=files["tiny-teacher"])
     # What is kept of one caption: the latent that each model makes in its own steps, from the noise of the seed.
     monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path / "results"))
     monkeypatch.setattr(text_models, "text_model_folders", lambda _: [tmp_path])
@@ -299,11 +290,10 @@ def test_a_student_is_trained_by_name_with_all_before_it(data, tmp_path, monkeyp
     assert told["caption"] == ONE_CAPTION and set(kept["weights"]) == digests
     # Finished models are read, and other settings are refused by name.
     again = train_stage.train_stage(data, OneVectorAWord(), PROFILE, "tiny-M2", folder=tmp_path, **QUIET)
-    assert all((a == b).all() for a, b in zip(*map(jax.tree.leaves, (again.params, made.params)), strict=True))
-    with pytest.raises(ValueError, match="other training settings \\(batch_size\\) lies there"):
-        train_stage.train_stage(
-            data, OneVectorAWord(), PROFILE, "tiny-VAE", folder=tmp_path, progress=False, batch_size=1
-        )
+    assert same_tree(again.params, made.params)
+    other = data, OneVectorAWord(), PROFILE, "tiny-VAE"
+    message = r"other training settings \(batch_size\) lies there"
+    refused(message, train_stage.train_stage, *other, folder=tmp_path, **QUIET | {"batch_size": 1})
     # The same by the one door: captions and lengths in, metres out, zero in padding; the steps that each may take.
     key, text = jax.random.key(1), np.zeros((2, 8), np.float32)
     draw = lambda model, **how: latent_motions(model, text, [12, 8], key, **how)
@@ -312,9 +302,6 @@ def test_a_student_is_trained_by_name_with_all_before_it(data, tmp_path, monkeyp
     np.testing.assert_array_equal(first, latent_motions(made, text, [12, 8], key, num_steps=2, guidance=14.0))
     assert steps_of(teacher) == 50 and steps_of(teacher, 3) == 3
     assert not np.array_equal(draw(teacher, num_steps=1), draw(teacher, num_steps=3))
-    with pytest.raises(ValueError, match="tiny-M2 takes 2 steps, got 1"):
-        draw(made, num_steps=1)
-    with pytest.raises(ValueError, match="is an autoencoder alone"):
-        draw(text_models.load_text_model(files["tiny-VAE"]))
-    with pytest.raises(ValueError, match="makes up to 40 frames, got 44"):
-        latent_motions(made, text, 44, key)
+    refused("tiny-M2 takes 2 steps, got 1", draw, made, num_steps=1)
+    refused("is an autoencoder alone", draw, text_models.load_text_model(files["tiny-VAE"]))
+    refused("makes up to 40 frames, got 44", latent_motions, made, text, 44, key)

@@ -22,10 +22,8 @@ from f3amd_lib.text.stages.text_models import is_latent_preset
 from f3amd_lib.text.stages.train_stage import stage_of
 
 PROFILE = load_profile("smoke", "bandai", train_steps=20)
-TEACHER, STUDENT = (
-    {"model": name, "trained": trained}
-    for name, trained in (("MotionPCM-teacher", "tiny-teacher"), ("MotionPCM-M2", "tiny-M2"))
-)
+TEACHER = {"model": "MotionPCM-teacher", "trained": "tiny-teacher"}
+STUDENT = {"model": "MotionPCM-M2", "trained": "tiny-M2"}
 REAL = {"dataset": "bandai", "model": "Real", "trained": "Real", "steps": 0}
 ROWS = {
     "text_pcm1": [REAL, {"dataset": "bandai", **STUDENT, "steps": 2}],
@@ -50,10 +48,8 @@ def tables(data, tmp_path_factory):
             training = {**preset.training, "num_frames": 40}
             patch.setitem(presets.PRESETS, name, dataclasses.replace(preset, training=training))
         about = {"folder": root / "models", "progress": False}
-        yield {
-            name: read_table(measure_text_table(name, data, OneVectorAWord(), PROFILE, rows=rows, **about))[0]
-            for name, rows in ROWS.items()
-        }
+        made = lambda name: measure_text_table(name, data, OneVectorAWord(), PROFILE, rows=ROWS[name], **about)
+        yield {name: read_table(made(name))[0] for name in ROWS}
 
 
 @pytest.mark.long
@@ -84,11 +80,8 @@ def test_reconstruction_is_judged_both_ways(data, monkeypatch):
     bench = type("Bench", (), {"real": data, "quality": lambda self, make: text_tables.pd.DataFrame()})()
 
     def figures(positions_of, vectors_of):
-        monkeypatch.setattr(
-            text_tables.motionpcm_sampling,
-            "reconstruction",
-            lambda trained, given, mask: (vectors_of(given), positions_of(given)),
-        )
+        made = lambda trained, given, mask: (vectors_of(given), positions_of(given))
+        monkeypatch.setattr(text_tables.motionpcm_sampling, "reconstruction", made)
         table = reconstruction_rows(bench, trained, {}, {}, None)
         return table.set_index("metric")["value"]
 

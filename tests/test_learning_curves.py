@@ -5,7 +5,7 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-from builders import HISTORY, WINDOW, packed_from, wandering_motion
+from builders import HISTORY, WINDOW, packed_from, refused, wandering_motion
 from f3amd_notebooks.power_law import power_law
 
 from f3amd_companion.__main__ import main
@@ -53,8 +53,7 @@ def test_the_interval_of_a_power_law_holds_the_truth_as_often_as_it_says():
     ],
 )
 def test_what_has_no_power_law_is_refused(windows, values, reach, message):
-    with pytest.raises(ValueError, match=message):
-        power_law(windows, values, reach)
+    refused(message, power_law, windows, values, reach)
 
 
 def test_unknown_names_end_with_status_2(capsys):
@@ -121,5 +120,5 @@ def test_the_command_tells_an_unfinished_leg_by_its_status(prepared, monkeypatch
 
 def test_a_measurement_without_weights_says_what_to_do(monkeypatch):
     monkeypatch.setattr(measure, "available_models", lambda profile: [])
-    with pytest.raises(ValueError, match="no trained model for 'synthetic' at profile 'smoke'"):
-        measure.models_with_weights(load_profile("smoke", "synthetic"))
+    message, profile = "no trained model for 'synthetic' at profile 'smoke'", load_profile("smoke", "synthetic")
+    refused(message, measure.models_with_weights, profile)

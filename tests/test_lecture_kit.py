@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
-import pytest
+from builders import refused
 from f3amd_notebooks.exercises import CHECKS
 from f3amd_notebooks.labs import LABS
 
@@ -16,15 +16,9 @@ KIT = SimpleNamespace(**runpy.run_path(str(ROOT / "docs" / "kit.py"), run_name="
 LECTURES = KIT.lectures()
 
 
-def test_twelve_lectures_name_sections_that_exist_and_fit_into_ninety_minutes():
-    parts = (ROOT / "docs" / "lectures.md").read_text(encoding="utf-8").split("\n## ")[1:]
-    assert len(LECTURES) == len(parts) == 12
-    for lecture, part in zip(LECTURES, parts, strict=True):
-        minutes = [int(number) for number in re.findall(r"^(?:\| |\*\*Board\*\* \()(\d+) ", part, re.M)]
-        assert len(minutes) == len(lecture["sections"]) + 1 and 55 <= sum(minutes) <= 90, lecture["title"]
-        assert all(KIT.section(KIT.read(name), head) for name, head in lecture["sections"])
-    with pytest.raises(ValueError, match="no section C3.9"):
-        KIT.section(KIT.read("course/03_solvers"), "C3.9")
+def test_lectures_name_sections_that_exist():
+    assert all(KIT.section(KIT.read(name), head) for lecture in LECTURES for name, head in lecture["sections"])
+    refused("no section C3.9", KIT.section, KIT.read("course/03_solvers"), "C3.9")
 
 
 def test_both_editions_have_all_questions_and_one_of_them_the_solutions():
@@ -88,5 +82,4 @@ def test_a_deck_has_each_figure_with_its_caption_and_loads_nothing_from_outside(
     assert found.returncode == 0, found.stdout
     assert sheets.read_text(encoding="utf-8").count(">Slides<") == 1
     sheets.write_text("<h1>Lectures</h1>", encoding="utf-8")
-    with pytest.raises(ValueError, match="0 headings, 1 lectures"):
-        KIT.link_kit(sheets)
+    refused("0 headings, 1 lectures", KIT.link_kit, sheets)

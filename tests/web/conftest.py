@@ -61,13 +61,8 @@ class Browser:
 
     def resize(self, width: int, height: int, *, phone: bool = False) -> None:
         """Set the size of the page in CSS pixels; a phone has two dots a pixel and a finger."""
-        self.command(
-            "Emulation.setDeviceMetricsOverride",
-            width=width,
-            height=height,
-            deviceScaleFactor=2 if phone else 1,
-            mobile=phone,
-        )
+        size = {"width": width, "height": height, "deviceScaleFactor": 2 if phone else 1}
+        self.command("Emulation.setDeviceMetricsOverride", **size, mobile=phone)
         self.command("Emulation.setTouchEmulationEnabled", enabled=phone, maxTouchPoints=5)
 
     def dark(self, wanted: bool = True) -> None:
@@ -146,18 +141,8 @@ class Browser:
         from selenium.webdriver.common.action_chains import ActionChains
         from selenium.webdriver.common.keys import Keys
 
-        named = {
-            "ArrowLeft": Keys.ARROW_LEFT,
-            "ArrowRight": Keys.ARROW_RIGHT,
-            "ArrowUp": Keys.ARROW_UP,
-            "ArrowDown": Keys.ARROW_DOWN,
-            "Home": Keys.HOME,
-            "End": Keys.END,
-            "Tab": Keys.TAB,
-            "Enter": Keys.ENTER,
-            "Escape": Keys.ESCAPE,
-        }
-        ActionChains(self.driver).send_keys(*(named.get(name, name) for name in names)).perform()
+        named = lambda name: getattr(Keys, name.replace("Arrow", "ARROW_").upper(), name)
+        ActionChains(self.driver).send_keys(*map(named, names)).perform()
 
     def touch(self, kind: str, *points: tuple[float, float]) -> None:
         """Send "touchStart", "touchMove" or "touchEnd" with fingers at these places."""

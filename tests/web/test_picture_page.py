@@ -110,12 +110,8 @@ def phases(count, gap):
 def test_a_picture_shows_what_the_library_computes(page, expected, values):
     name = expected.__name__
     found = page.script("return pictures[arguments[0]].compute(arguments[1])", name, values)["lines"]
-    drawn = (
-        {"normals": page.script("return pictures.normals(arguments[0], 60300)", values["seed"])}
-        if name == "paths"
-        else {}
-    )
-    known = expected(**values, **drawn)
+    normals = lambda: page.script("return pictures.normals(arguments[0], 60300)", values["seed"])
+    known = expected(**values, **({"normals": normals()} if name == "paths" else {}))
     assert found.keys() == known.keys()
     for line, points in known.items():
         points = [[float(np.squeeze(value)) for value in point] for point in points]

@@ -74,11 +74,9 @@ def test_lines_lie_on_the_picture_below_them(browser, page):
     before = browser.screenshot()
     browser.script("document.querySelectorAll('path[data-line]').forEach((p) => p.remove())")
     changed = np.ptp(np.stack([before, browser.screenshot()]).astype(int), axis=0).max(axis=-1) > 60
-    pictures = browser.script(
-        "return [...document.querySelectorAll('figure.slider img')].map((e) => e.getBoundingClientRect().toJSON())"
-    )
+    images = "[...document.querySelectorAll('figure.slider img')]"
     inside = np.zeros(changed.shape, bool)
-    for box in pictures:
+    for box in browser.script(f"return {images}.map((e) => e.getBoundingClientRect().toJSON())"):
         part = np.s_[int(box["top"]) : int(box["bottom"]) + 1, int(box["left"]) : int(box["right"]) + 1]
         assert changed[part].sum() > 300
         inside[part] = True

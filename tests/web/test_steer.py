@@ -94,6 +94,7 @@ def test_rounds_are_pythons_for_the_same_noise(browser, page, trained):
     opened(browser, page)
     for num_steps in (8, 1):
         same_as_python(browser, trained, num_steps, rounds=2)
+    assert browser.find("#where").text == "in WebAssembly on one thread"  # the usual page asks for no card
     assert browser.errors() == [] and browser.requests() == []
 
 
@@ -185,11 +186,6 @@ def test_a_slow_picture_gets_fewer_pixels_and_the_page_says_so(browser, page, sl
         assert canvas == pytest.approx(0.5 if slow else 1.0, abs=0.01)
     finally:
         browser.command("Page.removeScriptToEvaluateOnNewDocument", identifier=added["identifier"])
-
-
-def test_the_usual_page_asks_for_no_card(browser, page):
-    opened(browser, page)
-    assert browser.find("#where").text == "in WebAssembly on one thread"
 
 
 def test_a_square_driven_by_keys(browser, page, trained, screenshots, capsys):
