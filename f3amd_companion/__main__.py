@@ -655,7 +655,7 @@ def measure(
     Args:
       names: quality, walking, noise_use and so on; all if none. Of text to motion (--data bandai) text_judge,
         hands, text_table1, text_tableA1, text_table3, text_table4, text_tableA5, text_pcm1 to text_pcm4,
-        text_guidance, text_one_caption, by name alone.
+        text_guidance, by name alone.
       model: this preset; repeatable.
       published: CAMDM's published weights as safetensors, one more row of quality.
       minutes: of text to motion: stop after these with exit status 3; the same command continues.

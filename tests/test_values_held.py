@@ -54,7 +54,7 @@ def test_what_ships_was_trained_as_presets_and_profiles_say_today(path):
 TEXT = {
     "ACMDM-S-PS22-raw-n3": (TextMotionTraining, "denoiser", {"batch_size"}),
     "MotionPCM-teacher-small": (LatentMotionTraining, "teacher", set()),
-    "MotionPCM-M1-small": (LatentMotionTraining, "student", set()),
+    "MotionPCM-M1-small": (LatentMotionTraining, "student", {"batch_size"}),
 }
 
 

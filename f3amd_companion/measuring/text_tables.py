@@ -1,4 +1,4 @@
-"""Measurements of text to motion: `f3amd measure text_table1` and its like, `text_judge`, `hands`, `text_one_caption`.
+"""Measurements of text to motion: `f3amd measure text_table1` and its like, `text_judge`, `hands`.
 
 Rows of tables stand in `papers/PAPER/experiments.toml`. Each row's model is trained first, if it is not, by
 `text.stages.train_stage`; then it makes a motion for each held-out clip's caption, and the judge looks. A row is kept
@@ -46,7 +46,6 @@ from f3amd_lib.text.sampling.captioned_motion import draw_motions, motion_drawer
 from f3amd_lib.text.stages import text_models
 from f3amd_lib.text.stages.text_models import CONTROL, PELVIS, LatentModel, TextModel
 from f3amd_lib.text.stages.train_stage import STAGES, stage_of, stands_on, train_stage
-from f3amd_lib.training.checkpoints import network_with
 
 EXPERIMENTS = load_paper_file("experiments", "acmdm") | load_paper_file("experiments", "motionpcm")
 """Table -> its rows and what is trained for them; and the settings of each profile and plan."""
@@ -799,43 +798,8 @@ def measure_hands(
     return records.measure(todo, lambda row: {"hands": rows[row["model"]]()})
 
 
-ONE_CAPTION = "a person walks forward"
-"""The caption of `measure_one_caption`, and of notebook 21's strip."""
-
-
-def measure_one_caption(
-    data: TextMotions, encoder: TextEncoder, profile: Profile, *, models: Iterable[str] | None = None, **leg
-) -> Path:
-    """Keep the latent that a model makes of one caption in its own steps, from the noise of the profile's seed.
-
-    The autoencoder that ships decodes it, so that a picture needs no weights of the student.
-
-    Args:
-      data, encoder, profile: captioned motion, what embeds the caption, where results lie.
-      models: presets with weights; by default MotionLCM's, one step.
-
-    Returns:
-      The table, `records/text_one_caption.csv`: a row a token of the latent, its numbers in columns; `weights` are the
-      model's, `autoencoder` those that decode.
-    """
-    record = record_of(profile, data, "text_one_caption", text_encoder=encoder.identity, caption=ONE_CAPTION)
-    text, rows = jnp.asarray(embed_captions([ONE_CAPTION], encoder).pooled), []
-    for name in models or ["MotionLCM-V2-small"]:
-        trained = text_models.load_text_model(text_models.find_text_model(profile.dataset, name), LatentModel)
-        network, key = network_with(trained.config, trained.params), jax.random.key(profile.seed)
-        noise = jax.random.normal(key, trained.config.state_shape(1))
-        latent = motionpcm_sampling.latent_walk(trained)(network, text, noise, key)
-        table = pd.DataFrame(np.asarray(latent[0]), columns=[f"channel_{n}" for n in range(latent.shape[-1])])
-        digests = {"weights": weights_digest(trained.params), "autoencoder": weights_digest(trained.autoencoder_params)}
-        steps = motionpcm_sampling.steps_of(trained)
-        rows.append(table.assign(model=trained.name, steps=steps, token=range(len(table)), **digests))
-    path = records_folder(profile) / "text_one_caption.csv"
-    return write_table(path, pd.concat(rows), record)
-
-
 TEXT_MEASUREMENTS = {name: partial(measure_text_table, name) for name in TABLES} | {
     "text_judge": measure_judge,
     "hands": measure_hands,
-    "text_one_caption": measure_one_caption,
 }
 """What `f3amd measure` knows of text to motion, by name: functions of captioned motion, encoder and profile."""
