@@ -57,7 +57,7 @@ def caption_strip() -> tuple[Image | str, str]:
     if (found := committed_table("bandai", "captions")) is None:
         return "Not measured yet: `python scripts/caption_strip.py` draws twelve captions.", ""
     table, record = found
-    means = table.groupby("system", sort=False)[list(_SEEN)].mean().rename(columns=_SEEN).reset_index()
+    means = table.groupby("system", sort=False)[list(_SEEN)].mean().round(1).rename(columns=_SEEN).reset_index()
     picture = repository_root() / "paper_figures/bandai/laptop/media/captions.png"
     about = f"*Means of twelve captions; {machine_of(record)} {record['dataset_credit']}*"
     return Image(filename=picture), f"{markdown_table(means, digits=1)}\n\n{about}"
