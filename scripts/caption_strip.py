@@ -14,6 +14,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pandas as pd
+from PIL import Image
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this tree's library, whatever is installed
 
@@ -81,6 +82,14 @@ def draw(columns: dict[str, list[Motion]], credit: str):
     return figure
 
 
+def light(path: Path) -> None:
+    """Make a picture small enough for a notebook."""
+    picture = Image.open(path).convert("RGB")
+    picture.thumbnail((900, 4 * 900), Image.Resampling.LANCZOS)
+    few = picture.quantize(8, Image.Quantize.MAXCOVERAGE, kmeans=1, dither=Image.Dither.NONE)
+    few.save(path, optimize=True)
+
+
 def main() -> None:
     data, encoder = open_text_motions("bandai"), load_text_encoder()
     models = [load_text_model(PRETRAINED_DIR / "bandai" / "text" / f"{name}.safetensors") for name in MODELS]
@@ -100,7 +109,8 @@ def main() -> None:
     folder = repository_root() / "paper_figures/bandai/laptop"
     write_table(folder / "records/captions.csv", pd.DataFrame(rows), record)
     source = data.credit.partition(";")[0]
-    save_figure(draw(columns, f"{source}; non-commercial use."), folder / "media/captions.png")
+    path = save_figure(draw(columns, f"{source}; non-commercial use."), folder / "media/captions.png")
+    light(path)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 from builders import captioned_walks
 from model_cards import measured_table
-from pages import fill_tables
+from page_tables import fill_tables
 
 from f3amd_companion.__main__ import main
 from f3amd_companion.ledger.evidence import committed_quality

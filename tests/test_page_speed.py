@@ -2,7 +2,7 @@
 
 import page_speed
 import pandas as pd
-from pages import fill_tables
+from page_tables import fill_tables
 
 from f3amd_lib.ground.records import run_record, write_table
 
