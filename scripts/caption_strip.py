@@ -14,13 +14,13 @@ from pathlib import Path
 import jax
 import numpy as np
 import pandas as pd
-from PIL import Image
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this tree's library, whatever is installed
 
 from f3amd_companion.serving.foot_locking import lock_feet
 from f3amd_lib.drawing.pictures import draw_poses
-from f3amd_lib.drawing.style import new_figure, plot_style, save_figure
+from f3amd_lib.drawing.style import new_figure, plot_style, show_figure
+from f3amd_lib.ground.files import write_whole
 from f3amd_lib.ground.profiles import load_profile, repository_root
 from f3amd_lib.ground.records import run_record, write_table
 from f3amd_lib.ground.trees import weights_digest
@@ -72,22 +72,14 @@ def seen(skeleton, fps: float, positions: np.ndarray) -> tuple[Motion, dict]:
 def draw(columns: dict[str, list[Motion]], credit: str):
     """Draw a row of poses for each caption and column."""
     figure, axes = new_figure(13.0, 1.25 * len(CAPTIONS), len(CAPTIONS), len(columns))
-    for (title, motions), axis in zip(columns.items(), axes[0], strict=True):
-        axis.set_title(title, fontsize=11, pad=18)
-        for caption, motion, panel in zip(CAPTIONS, motions, axes[:, list(columns).index(title)], strict=True):
+    for (title, motions), panels in zip(columns.items(), axes.T, strict=True):
+        panels[0].set_title(title, fontsize=11, pad=18)
+        for motion, panel in zip(motions, panels, strict=True):
             draw_poses(panel, motion, np.linspace(0, FRAMES - 1, POSES).astype(int), scale=34.0, numbered=False)
-            if panel in axes[:, 0]:
-                panel.text(0.0, 1.0, caption, transform=panel.transAxes, fontsize=9, fontweight="bold")
+    for caption, panel in zip(CAPTIONS, axes[:, 0], strict=True):
+        panel.text(0.0, 1.0, caption, transform=panel.transAxes, fontsize=9, fontweight="bold")
     figure.supxlabel(credit, fontsize=7)
     return figure
-
-
-def light(path: Path) -> None:
-    """Make a picture small enough for a notebook."""
-    picture = Image.open(path).convert("RGB")
-    picture.thumbnail((900, 4 * 900), Image.Resampling.LANCZOS)
-    few = picture.quantize(8, Image.Quantize.MAXCOVERAGE, kmeans=1, dither=Image.Dither.NONE)
-    few.save(path, optimize=True)
 
 
 def main() -> None:
@@ -109,8 +101,8 @@ def main() -> None:
     folder = repository_root() / "paper_figures/bandai/laptop"
     write_table(folder / "records/captions.csv", pd.DataFrame(rows), record)
     source = data.credit.partition(";")[0]
-    path = save_figure(draw(columns, f"{source}; non-commercial use."), folder / "media/captions.png")
-    light(path)
+    light = show_figure(draw(columns, f"{source}; non-commercial use."), dpi=70, colors=8)  # a notebook holds it
+    write_whole(folder / "media/captions.png", light.data)
 
 
 if __name__ == "__main__":
