@@ -86,6 +86,8 @@ class Browser:
         address = page.resolve().as_uri() if isinstance(page, Path) else str(page)
         self._page = address.partition("#")[0]  # as it is asked for
         self.driver.get(address)
+        # A busy machine's driver may answer for the empty page before.
+        self.wait("return document.readyState === 'complete' && location.href !== 'about:blank'")
         return self
 
     def _listen(self) -> None:
