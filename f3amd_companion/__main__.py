@@ -811,14 +811,13 @@ def course(only: Repeatable = ()) -> None:
     notebook_runs.run_course(only, say=log.info)
 
 
-def claims(accept: bool = False, paper: str | None = None) -> int:
-    """Judge the papers' claims from records; writes paper_figures/claims.md and claims_<paper>.md.
+def claims(paper: str | None = None) -> int:
+    """Judge the papers' claims from records, and say which verdicts are not the accepted ones.
 
     Args:
-      accept: accept changed verdicts and write them.
       paper: whose claims, such as acmdm; each paper's if none.
     """
-    return ledger.main(accept, paper)
+    return ledger.main(paper)
 
 
 def convert(

@@ -18,8 +18,9 @@ from page_tables import fill_tables
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this tree's library, whatever is installed
 
+from f3amd_notebooks.quality_tables import committed_quality
+
 from f3amd_companion.ledger.claims import load_claims
-from f3amd_companion.ledger.evidence import committed_quality
 from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.ground.tables import markdown_table
 from f3amd_lib.networks.presets import find_preset

@@ -19,7 +19,8 @@ from page_tables import fill_tables
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this tree's library, whatever is installed
 
-from f3amd_companion.ledger.evidence import committed_quality
+from f3amd_notebooks.quality_tables import committed_quality
+
 from f3amd_lib.ground.files import read_toml, write_whole
 from f3amd_lib.ground.names import counted_cores
 from f3amd_lib.ground.papers import load_paper_file

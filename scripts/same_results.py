@@ -33,6 +33,7 @@ if version("jaxlib") == "0.10.2":  # half of that time; XLA ends a process that 
 import jax
 import numpy as np
 import pandas as pd
+from claims_page import ledger_markdown
 from model_cards import card_of, measured_table
 from safetensors.numpy import load_file
 
@@ -41,11 +42,10 @@ sys.path.insert(1, str(Path(__file__).resolve().parents[1] / "notebooks"))
 
 from f3amd_notebooks.beside_printed import beside_printed, speedups_by_turns, times_beside_paper, training_beside_paper
 from f3amd_notebooks.equation_map import equation_map
-from f3amd_notebooks.quality_tables import QUALITY_TABLES, of_queue, quality_markdown
+from f3amd_notebooks.quality_tables import QUALITY_TABLES, committed_quality, of_queue, quality_markdown
 from f3amd_notebooks.readings import readings_table
 
-from f3amd_companion.ledger.claims import judge_claims, ledger, ledger_markdown
-from f3amd_companion.ledger.evidence import committed_quality
+from f3amd_companion.ledger.claims import judge_claims, ledger
 from f3amd_companion.measuring.consistency_task import distil
 from f3amd_companion.serving.artefact import JAX_EXPORT, MANIFEST, STABLEHLO, load_artefact
 from f3amd_companion.serving.crowd import generate_crowd

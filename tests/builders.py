@@ -286,3 +286,13 @@ def placed(path: RootPath, position, yaw: float = 0.0) -> RootPath:
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     turned = (path.position - path.position[0]) @ turn
     return RootPath(turned + np.asarray(position, np.float64), path.yaw + angle, path.fps)
+
+
+@functools.cache
+def load_commands(paper: str = "f3amd") -> dict[str, list[str]]:
+    """Return what one types to measure each claim again: id -> command lines, in the order of `commands.toml`."""
+    from f3amd_companion.ledger.claims import load_claims  # here: most tests do without the ledger
+    from f3amd_lib.ground.papers import load_paper_file
+
+    commands = load_paper_file("commands", paper)["command"]
+    return {name: [one["run"] for one in commands if name in one["claims"]] for name in load_claims(paper)}

@@ -3,6 +3,7 @@
 from itertools import product
 
 import pytest
+from builders import load_commands
 from test_claims import keep
 
 from f3amd_companion.ledger import claims
@@ -77,7 +78,7 @@ def judged(root, tables, paper=PAPER):
 
 
 def test_every_claim_holds_in_the_papers_world_and_fails_in_the_other(tmp_path):
-    assert list(claims.load_claims(PAPER)) == list(claims.load_commands(PAPER))
+    assert list(claims.load_claims(PAPER)) == list(load_commands(PAPER))
     right, wrong = judged(tmp_path / "right", world()), judged(tmp_path / "wrong", world(true=False))
     assert len(right) == 17 and {claim: found.verdict for claim, found in right.items()} == dict.fromkeys(right, HOLDS)
     assert {claim: found.verdict for claim, found in wrong.items()} == dict.fromkeys(wrong, FAILS)

@@ -3,6 +3,7 @@
 import functools
 from itertools import product
 
+import claims_page
 import numpy as np
 import pandas as pd
 import pytest
@@ -10,7 +11,10 @@ from builders import refused
 
 from f3amd_companion.ledger import claims, theory
 from f3amd_companion.ledger.evidence import (
+    NINE_METRICS,
+    OF_TEXT,
     OF_TRAINED_NETWORKS,
+    REFERENCE_ROWS,
     Figure,
     mean_figure,
     paper_evidence,
@@ -43,7 +47,6 @@ from f3amd_lib.ground.records import write_table
 from f3amd_lib.ground.stored import committed_table
 from f3amd_lib.networks.attention import TransformerBlock
 from f3amd_lib.networks.spectral import FNOBlock
-from f3amd_lib.papers.printed import NINE_METRICS, OF_TEXT, REFERENCE_ROWS
 
 # --------------------------------------------------------------------------------- made-up records
 
@@ -718,8 +721,10 @@ def test_the_committed_page_and_verdicts_follow_from_the_committed_records(paper
     judgements, path = claims.judge_claims(paper=paper), claims.ledger_path(paper)
     frame = claims.ledger(judgements)
     changes = claims.changed_verdicts(frame, claims.accepted_verdicts(path))
-    assert not changes, "\n".join(changes) + "\nIf these are right: f3amd claims --accept"
-    assert path.read_text(encoding="utf-8") == claims.ledger_markdown(judgements), f"{path} is stale: f3amd claims"
+    assert not changes, "\n".join(changes) + "\nIf these are right: scripts/claims_page.py --accept"
+    assert path.read_text(encoding="utf-8") == claims_page.ledger_markdown(judgements), (
+        f"{path}: scripts/claims_page.py"
+    )
     assert len(frame) == count and set(frame["verdict"]) | set(frame["paper_verdict"]) <= set(VERDICTS)
     measured = frame[~frame["verdict"].isin([UNMEASURED]) & (frame["dataset"] != "computed")]
     assert (measured[["dataset", "hardware", "record"]] != "").all(axis=None)
@@ -728,13 +733,13 @@ def test_the_committed_page_and_verdicts_follow_from_the_committed_records(paper
 def test_a_changed_verdict_is_noticed_until_it_is_accepted(tmp_path):
     holds, fails = ([judge(keep(tmp_path / str(i), tables), "Q13")] for i, tables in enumerate((SOUND, WRONG)))
     path = tmp_path / "claims.md"
-    assert claims.write_ledger(path, holds) and not path.exists()
-    claims.write_ledger(path, holds, accept=True)
+    assert claims_page.write_ledger(path, holds) and not path.exists()
+    claims_page.write_ledger(path, holds, accept=True)
     page = path.read_text()
-    assert claims.write_ledger(path, holds) == []
-    (change,) = claims.write_ledger(path, fails)
+    assert claims_page.write_ledger(path, holds) == []
+    (change,) = claims_page.write_ledger(path, fails)
     assert change.startswith("Q13 by our records: was 'holds', is 'does not hold' (") and path.read_text() == page
-    claims.write_ledger(path, fails, accept=True)
+    claims_page.write_ledger(path, fails, accept=True)
     assert claims.accepted_verdicts(path)["Q13"]["verdict"] == FAILS
 
 

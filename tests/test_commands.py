@@ -5,12 +5,14 @@ import itertools
 import re
 import shlex
 
+import claims_page
 import pandas as pd
 import pytest
+from builders import load_commands
 
 from f3amd_companion.__main__ import main
 from f3amd_companion.ledger import claims
-from f3amd_companion.ledger.evidence import recorded_evidence, snapshot_evidence
+from f3amd_companion.ledger.evidence import NINE_METRICS, recorded_evidence, snapshot_evidence
 from f3amd_companion.ledger.judgements import UNMEASURED
 from f3amd_companion.measuring import campaign, measure, sensitivity
 from f3amd_companion.measuring import times as measurements
@@ -24,9 +26,9 @@ from f3amd_lib.ground.records import write_table
 from f3amd_lib.measures import protocol
 from f3amd_lib.measures.corruptions import CORRUPTIONS
 from f3amd_lib.networks import presets
-from f3amd_lib.papers.printed import NINE_METRICS, PUBLISHED_CAMDM
+from f3amd_lib.papers.printed import PUBLISHED_CAMDM
 
-COMMANDS = list(dict.fromkeys(run for runs in claims.load_commands().values() for run in runs))
+COMMANDS = list(dict.fromkeys(run for runs in load_commands().values() for run in runs))
 
 
 def asked(run: str):
@@ -111,7 +113,7 @@ OF_SEEDS = {"seen once", "not seen at half its length", "not converged: no train
 def test_a_claims_commands_measure_all_that_its_rule_looks_up(claim, tmp_path):
     """All that the commands would write, and nothing else, is enough to judge every statement."""
     left: dict[tuple, list] = {}
-    for run in claims.load_commands()[claim.id]:
+    for run in load_commands()[claim.id]:
         _, data, profile, *_ = asked(run)
         for name, rows in tables(run).items():
             left.setdefault((data, profile, name), []).extend(rows)
@@ -132,9 +134,9 @@ def test_a_claims_commands_measure_all_that_its_rule_looks_up(claim, tmp_path):
 
 @pytest.mark.slow
 def test_every_claim_has_a_command_that_the_ledger_prints():
-    page = claims.ledger_markdown(claims.judge_claims())
+    page = claims_page.ledger_markdown(claims.judge_claims())
     listed = {run: ids.split(", ") for ids, run in re.findall(r"^# ([\w, ]+)\n(.+)$", page, re.M)}
-    for claim_id, runs in claims.load_commands().items():
+    for claim_id, runs in load_commands().items():
         assert all(claim_id in listed[run] for run in runs), claim_id
 
 
@@ -155,7 +157,7 @@ def test_a_command_is_understood(run, monkeypatch):
     command, _, _, window, what, models = asked(run)
     status = main(shlex.split(run)[1:])
     if command == "claims":
-        assert called == [(False, None)] and status == 0
+        assert called == [(None,)] and status == 0
     elif command == "campaign":
         assert called == ["gpu"] and status == 0
     elif what == "training":
@@ -188,7 +190,7 @@ def test_a_command_of_text_to_motion_reaches_what_its_claim_is_about(paper, clai
     for name in TEXT_MEASUREMENTS:
         monkeypatch.setitem(TEXT_MEASUREMENTS, name, lambda *_, name=name, **__: asked.append(name) or "table")
     monkeypatch.setattr(claims, "main", lambda *words: 0)
-    for run in claims.load_commands(paper)[claim_id]:
+    for run in load_commands(paper)[claim_id]:
         assert main(shlex.split(run, comments=True)[1:]) == 0
     (entry,) = (entry for entry in load_paper_file("claims", paper)["claim"] if entry["id"] == claim_id)
     tables_of_ours = told(entry["statement"], "table") & set(TABLES)

@@ -4,11 +4,10 @@ import dataclasses
 
 import numpy as np
 import pytest
-from builders import captioned_walks
+from builders import captioned_walks, load_commands
 from test_latent_models import TINY
 from test_text_judge import OneVectorAWord
 
-from f3amd_companion.ledger import claims
 from f3amd_companion.measuring import text_tables
 from f3amd_companion.measuring.text_tables import TABLES, measure_text_table, reconstruction_rows
 from f3amd_lib.ground.papers import load_paper_file
@@ -98,7 +97,7 @@ def test_reconstruction_is_judged_both_ways(data, monkeypatch):
 def test_the_files_rows_name_presets_columns_and_commands():
     about = load_paper_file("experiments", "motionpcm")
     assert set(about) <= set(TABLES)
-    typed = " ".join(run for runs in claims.load_commands("motionpcm").values() for run in runs)
+    typed = " ".join(run for runs in load_commands("motionpcm").values() for run in runs)
     for name, table in about.items():
         assert f"f3amd measure {name} " in typed or name in ("text_pcm3", "text_guidance")  # of no claim
         for row in table["rows"]:

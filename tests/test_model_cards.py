@@ -10,11 +10,11 @@ import model_cards
 import pandas as pd
 import pytest
 from builders import captioned_walks
+from f3amd_notebooks.quality_tables import committed_quality
 from model_cards import measured_table
 from page_tables import fill_tables
 
 from f3amd_companion.__main__ import main
-from f3amd_companion.ledger.evidence import committed_quality
 from f3amd_lib.ground.profiles import repository_root
 from f3amd_lib.ground.stored import committed_table
 from f3amd_lib.ground.trees import describe, weights_digest

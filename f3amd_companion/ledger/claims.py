@@ -7,41 +7,38 @@ follows from recorded figures alone, and from none of ours to none of the paper'
 which do not always say what its text says.
 
 The verdicts are committed. When a new measurement changes one, a test fails until somebody has
-looked at it and accepts the change on purpose (`--accept`).
+looked at it and accepts the change on purpose (`scripts/claims_page.py --accept`).
 """
 
 from __future__ import annotations
 
 import functools
-import html
 import inspect
 import json
-import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 
 from f3amd_companion.ledger import judgements as judging
 from f3amd_companion.ledger import theory
 from f3amd_companion.ledger.evidence import (
+    TIMES,
     Evidence,
     Network,
     NotMeasured,
+    check_model,
     paper_evidence,
     recorded_evidence,
     snapshot_evidence,
 )
 from f3amd_companion.ledger.gate import why_not_judged
 from f3amd_lib.ground import log
-from f3amd_lib.ground.files import read_toml, write_whole
 from f3amd_lib.ground.papers import check_entry, find_entry, has_paper_file, load_paper_file, paper_folders
-from f3amd_lib.ground.profiles import load_profile, repository_root
-from f3amd_lib.ground.tables import compact_table, markdown_table
+from f3amd_lib.ground.profiles import repository_root
 from f3amd_lib.measures.registry import METRICS
-from f3amd_lib.papers.printed import SCHEMAS, TIMES, check_model
+from f3amd_lib.papers.printed import SCHEMAS
 
 DATASET_ORDER = ("bandai", "synthetic", "folder")
 """Whose records decide: Bandai's motion first; CAMDM's published weights walk on a folder alone. All
@@ -50,7 +47,7 @@ statements of a claim come from one data set, but for times, which another may h
 PROFILE_ORDER = ("gpu", "laptop")
 """Within a data set, where a figure is looked for first. Smoke runs decide nothing."""
 
-_MARKS = dict(zip(judging.VERDICTS, "✓±>✗≈○", strict=False)) | {judging.REMARK: "·"}
+MARKS = dict(zip(judging.VERDICTS, "✓±>✗≈○", strict=False)) | {judging.REMARK: "·"}
 
 _KINDS = {
     name: function
@@ -207,13 +204,6 @@ def load_claims(paper: str = "f3amd") -> dict[str, Claim]:
     return read_claims(load_paper_file("claims", paper), paper, f"{paper}/claims.toml")
 
 
-@functools.cache
-def load_commands(paper: str = "f3amd") -> dict[str, list[str]]:
-    """Return what one types to measure each claim again: id -> command lines, in the order of `commands.toml`."""
-    commands = load_paper_file("commands", paper)["command"]
-    return {name: [one["run"] for one in commands if name in one["claims"]] for name in load_claims(paper)}
-
-
 # ------------------------------------------------------------------------------------------ judging
 
 
@@ -313,7 +303,7 @@ def judge_claims(root=None, dataset=DATASET_ORDER, profile=PROFILE_ORDER, paper:
 def _figures(statements: Sequence[Statement]) -> str:
     """Return all figures in one line, each with a mark for its verdict; or why there are none, or no verdict."""
     gaps = [s.figure for s in statements if s.verdict == judging.UNMEASURED]
-    measured = [f"{_MARKS[s.verdict]} {s.figure}" for s in statements if s.verdict and s.verdict != judging.UNMEASURED]
+    measured = [f"{MARKS[s.verdict]} {s.figure}" for s in statements if s.verdict and s.verdict != judging.UNMEASURED]
     if not measured:
         first, *others = dict.fromkeys(gaps) or [""]
         return first + (f"; and {len(others)} more" if others else "")
@@ -379,101 +369,9 @@ def statement_table(judgement: Judgement) -> pd.DataFrame:
     return found.reindex(list(says)).dropna(how="all").fillna("").rename(says).rename_axis("statement").reset_index()
 
 
-def _by_group(judgements: Sequence[Judgement]) -> dict[str, list[Judgement]]:
-    groups: dict[str, list[Judgement]] = {}
-    for each in judgements:
-        groups.setdefault(each.claim.group, []).append(each)
-    return groups
-
-
-def _short(statement: Statement | None) -> str:
-    """Return what was found of a statement, behind its mark; metrics that miss and models stay in `statement_table`."""
-    if statement is None or statement.verdict == judging.UNMEASURED:
-        return ""
-    figure = re.sub(r"; not: [^;]*| over \d+ models \(.*?\)| in the range", "", statement.figure)
-    return f"{_MARKS[statement.verdict]} {figure}"
-
-
-def _side(verdict: str, statements: Sequence[Statement], where: str = "") -> str:
-    """Return one side's verdict on a claim behind its mark, where it holds, and the first reason why it is none."""
-    mark, why = _MARKS.get(verdict, ""), next((f": {reason}" for one in statements for reason in one.reasons), "")
-    return f"**{f'{mark} {verdict}'.strip()}**{where}{why}"
-
-
-def claims_table(judgements: Sequence[Judgement]) -> str:
-    """Return claims as Markdown: two columns of verdicts, and below each claim its statements with their figures."""
-    rows = []
-    for each in judgements:
-        claim, on = each.claim, [name for name in (each.dataset, *each.times_of) if name in DATASET_ORDER[1:]]
-        where = f" ({', '.join(on)})" if on else ""
-        sides = (_side(each.verdict, each.ours, where), _side(each.paper_verdict, each.paper))
-        rows.append((f"**{claim.id}** {claim.text} ({claim.where})", *sides))
-        ours, paper = ({one.says: one for one in some} for some in (each.ours, each.paper))
-        found = ((one.says, _short(ours.get(one.says)), _short(paper.get(one.says))) for one in claim.statements)
-        rows += [row for row, one in zip(found, claim.statements, strict=True) if any(row[1:]) and not one.remark]
-    return compact_table(pd.DataFrame(rows, columns=["claim", "ours", "the paper's tables"]))
-
-
-def marks_picture(judgements: Sequence[Judgement]) -> str:
-    """Return all verdicts as an SVG: a panel a group, a line a claim, a mark by our records and one by the paper's."""
-    colors = read_toml(Path(__file__).with_name("claims_page.toml"))["colors"]
-    groups = _by_group(judgements)
-    width, height = 190 * len(groups), 50 + 22 * max(map(len, groups.values()))
-    write = lambda x, y, text, how="": f'<text x="{x}" y="{y}" {how}>{html.escape(text)}</text>'
-    drawn = [f'<rect width="{width}" height="{height}" fill="white"/>']
-    for panel, (group, some) in enumerate(groups.items()):
-        x = 10 + 190 * panel
-        drawn.append(write(x, 18, group, 'font-weight="bold"'))
-        drawn += [write(x + 40, 38, "ours"), write(x + 95, 38, "paper's")]
-        for row, each in enumerate(some):
-            drawn.append(write(x, 60 + 22 * row, each.claim.id))
-            for place, verdict in ((x + 40, each.verdict), (x + 95, each.paper_verdict)):
-                box = f'x="{place}" y="{45 + 22 * row}" width="40" height="20" fill="{colors[verdict]}"'
-                mark = write(place + 20, 60 + 22 * row, _MARKS.get(verdict, ""), 'text-anchor="middle"')
-                drawn.append(f"<rect {box}><title>{each.claim.id}: {verdict}</title></rect>{mark}")
-    shape = f'viewBox="0 0 {width} {height}" width="{width}" height="{height}"'
-    style = 'font-family="sans-serif" font-size="13"'
-    return "\n".join([f'<svg xmlns="http://www.w3.org/2000/svg" {shape} {style}>', *drawn, "</svg>", ""])
-
-
-def ledger_markdown(judgements: Sequence[Judgement]) -> str:
-    """Render the ledger of one paper as Markdown: picture, counts, a table a group, records and commands, rules last.
-
-    Args:
-      judgements: from `judge_claims`, at least one.
-    """
-    paper = judgements[0].claim.paper
-    texts = read_toml(Path(__file__).with_name("claims_page.toml"))
-    about, words = load_paper_file("paper", paper), texts["page"] | load_paper_file("claims", paper).get("page", {})
-    training = {"windows": {}, "says": "their number is not known"} | about.get("training", {})
-    gpu = load_profile("gpu", "100style")
-    seen = gpu.train_steps * gpu.batch_size
-    share = 100.0 * seen / training["windows"].get("32", np.nan)
-    fields = {"steps": gpu.train_steps, "batch": gpu.batch_size, "seen": seen / 1e6, "share": share}
-    fields |= {"windows": training["says"], "here": scale(judgements)}
-    fields |= {key: text.strip().format(**fields) for key, text in words.items()}
-    fields |= {"count": len(load_claims(paper)), "name": about["name"], "setting": about["setting"], "paper": paper}
-    fields |= {"marks": ", ".join(f"{mark} {verdict}" for verdict, mark in _MARKS.items() if verdict)}
-    fields |= {"picture": ledger_path(paper).with_suffix(".svg").name}
-    verdicts = {"ours": [one.verdict for one in judgements]}
-    verdicts["the paper's tables"] = [one.paper_verdict for one in judgements]
-    counts = pd.DataFrame({side: pd.Series(some).value_counts() for side, some in verdicts.items()})
-    counts = counts.reindex(judging.VERDICTS).fillna(0).astype(int).rename_axis("verdict").reset_index()
-    records: dict[tuple[str, str], list[str]] = {}
-    for each in judgements:
-        places = [(one.place, one.hardware) for found in each.ours if each.dataset for one in found.sources]
-        for place in dict.fromkeys(places):
-            records.setdefault(place, []).append(each.claim.id)
-    looked = [{"record": place, "device": device, "claims": ", ".join(ids)} for (place, device), ids in records.items()]
-    typed = [f"# {', '.join(one['claims'])}\n{one['run']}" for one in load_paper_file("commands", paper)["command"]]
-    return "\n".join([
-        texts["head"].format(**fields),
-        markdown_table(counts),
-        *(f"## {group}\n\n{claims_table(some)}" for group, some in _by_group(judgements).items()),
-        f"## Records and commands\n\n{compact_table(pd.DataFrame(looked))}",
-        "```sh", *typed, "```",
-        texts["tail"].format(**fields),
-    ])  # fmt: skip
+def papers_with_claims() -> list[str]:
+    """Return the folders of the papers that have a ledger."""
+    return [name for name in paper_folders() if has_paper_file("claims", name)]
 
 
 def ledger_path(paper: str = "f3amd") -> Path:
@@ -494,7 +392,7 @@ def accepted_verdicts(path: Path | None = None) -> dict[str, dict[str, str]]:
     return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
 
 
-def _verdicts(frame: pd.DataFrame) -> dict[str, dict[str, str]]:
+def verdicts_of(frame: pd.DataFrame) -> dict[str, dict[str, str]]:
     """Return what is accepted of a ledger, in the form of `accepted_verdicts`."""
     columns = ["verdict", "ours", "paper_verdict", "paper_figure"]
     return frame.set_index("id")[columns].rename(columns={"ours": "figure"}).to_dict("index")
@@ -507,7 +405,7 @@ def changed_verdicts(frame: pd.DataFrame, accepted: Mapping[str, Mapping[str, st
       frame: from `ledger`.
       accepted: from `accepted_verdicts`.
     """
-    verdicts, sides = _verdicts(frame), {"our records": "", "the paper's tables": "paper_"}
+    verdicts, sides = verdicts_of(frame), {"our records": "", "the paper's tables": "paper_"}
     changes = [
         f"{name} by {whose}: was {was!r}, is {now[f'{side}verdict']!r} ({now[f'{side}figure']})"
         for name, now in verdicts.items()
@@ -517,36 +415,14 @@ def changed_verdicts(frame: pd.DataFrame, accepted: Mapping[str, Mapping[str, st
     return changes + [f"{name}: is no claim any more" for name in accepted if name not in verdicts]
 
 
-def write_ledger(path: Path, judgements: Sequence[Judgement], *, accept: bool = False) -> list[str]:
-    """Write the ledger as Markdown, and with `accept` its verdicts.
+def main(paper: str | None = None) -> int:
+    """Judge the papers' claims from records, and say which verdicts are not the accepted ones.
 
     Args:
-      path: where to, ending in .md. The accepted verdicts lie beside it as JSON.
-      judgements: from `judge_claims`.
-      accept: accept changed verdicts and write them.
-
-    Returns:
-      What changed, as from `changed_verdicts`. Without `accept` a change leaves both files alone.
-    """
-    frame = ledger(judgements)
-    changes = changed_verdicts(frame, accepted_verdicts(path))
-    if accept or not changes:
-        write_whole(path, ledger_markdown(judgements))
-        write_whole(path.with_suffix(".svg"), marks_picture(judgements))
-        kept = json.dumps(_verdicts(frame), indent=2, ensure_ascii=False)
-        write_whole(path.with_suffix(".json"), f"{kept}\n")
-    return changes
-
-
-def main(accept: bool = False, paper: str | None = None) -> int:
-    """Judge the papers' claims from records; writes paper_figures/claims.md and claims_<paper>.md.
-
-    Args:
-      accept: accept changed verdicts and write them.
       paper: whose claims; each paper's if none.
 
     Returns:
-      Exit status: 0 if the ledgers were written, 1 if a verdict changed and was not accepted.
+      Exit status: 1 if a verdict changed.
 
     Raises:
       ValueError: outside a clone of the repository, where the records lie.
@@ -554,14 +430,11 @@ def main(accept: bool = False, paper: str | None = None) -> int:
     status, folder = 0, ledger_path().parent
     if not folder.is_dir():
         raise ValueError(f"{folder}: has no records; run this in a clone of the repository")
-    for name in [paper] if paper else [name for name in paper_folders() if has_paper_file("claims", name)]:
-        path = ledger_path(name)
-        changes = write_ledger(path, judge_claims(paper=name), accept=accept)
-        for change in changes:
-            log.info("%s", change)
-        if changes and not accept:
-            log.error("Nothing was written. If these verdicts are right: --accept")
+    for name in papers_with_claims() if paper is None else [paper]:
+        frame, path = ledger(judge_claims(paper=name)), ledger_path(name)
+        counts = frame["verdict"].value_counts().items()
+        log.info("%-12s %s", name, ", ".join(f"{count} {verdict}" for verdict, count in counts))
+        for change in changed_verdicts(frame, accepted_verdicts(path)):
+            log.error("%s", change)
             status = 1
-        else:
-            log.info("%s is up to date", path.relative_to(repository_root()))
     return status

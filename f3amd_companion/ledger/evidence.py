@@ -15,14 +15,100 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from f3amd_lib.ground.names import asked_network, check_known, counted_cores
-from f3amd_lib.ground.papers import load_paper_file, paper_folders
+from f3amd_lib.ground.names import asked_network, check_known, counted_cores, nearest_hint
+from f3amd_lib.ground.papers import load_paper_file, load_paper_table, paper_folders
 from f3amd_lib.ground.profiles import DATASETS, PROFILES
 from f3amd_lib.ground.records import folder_reason, read_table
-from f3amd_lib.ground.stored import committed_table
 from f3amd_lib.measures.distributions import intervals_over_repeats, mean_and_interval
-from f3amd_lib.measures.registry import SHOWN
-from f3amd_lib.papers import printed
+from f3amd_lib.measures.walking import CHECKS
+from f3amd_lib.networks import presets
+from f3amd_lib.papers.printed import PUBLISHED_CAMDM, SCHEMAS, printed_tables
+
+# --------------------------------------------------------------------------------- tables as claims want them
+
+
+TIMES = ("synthesis_time", "training_time")
+"""Those of them that hang on the device."""
+
+_VALUES = {"x0_by_sigma": "x0_error"}
+
+NINE_METRICS = {
+    row.metric: (row.unit, row.better)
+    for row in load_paper_table(3).drop_duplicates("metric")[["metric", "unit", "better"]].itertuples(index=False)
+}
+"""The metrics of Table 3, in its order -> (unit, "up" or "down")."""
+
+OF_TEXT = tuple(name for name in SCHEMAS if name.startswith("text_"))
+"""Tables of text to motion. Each row also names `trained`, the model that was (a smaller one of ours may stand in for
+the paper's), and `windows`, the motions that it was trained on."""
+
+REFERENCE_ROWS = ("real", "frozen pose", "shuffled frames", "noisy motion", PUBLISHED_CAMDM, "CAMDM, leading")
+"""Names in the model column that are no presets."""
+
+
+def _with_interval_of_median(table: pd.DataFrame) -> pd.DataFrame:
+    """Put the interval of the median of timed rounds in the place of their spread.
+
+    Records have it as `median_low` and `median_high`. Older ones have the 5 and 95 % quantiles of the
+    rounds and their number alone: as for a normal distribution, on either side of its own, the median
+    reaches 1.96 sqrt(pi / 2) / sqrt(rounds) deviations, and those quantiles 1.645.
+    """
+    if "rounds" not in table:
+        return table
+    reach = 1.96 / 1.645 * np.sqrt(np.pi / 2.0 / table["rounds"])
+    bounds = {bound: table["value"] + reach * (table[bound] - table["value"]) for bound in ("low", "high")}
+    known = {bound: table.get(f"median_{bound}", about).fillna(about) for bound, about in bounds.items()}
+    return table.assign(**known)
+
+
+def checked_table(name: str, table: pd.DataFrame, where: str, others: Sequence[str] = ()) -> pd.DataFrame:
+    """Return a table in the form of `SCHEMAS`, undefined figures left out; ValueError if broken.
+
+    `others` are models that are no presets.
+    """
+    keys = SCHEMAS[name]
+    table = table.rename(columns={_VALUES.get(name, "value"): "value"})
+    if name == "walking" and set(keys) - set(table) == {"metric"}:  # a row per style and seed, its figures side by side
+        means = table.groupby(keys[:-1])[[check for check in CHECKS if check in table]].mean()
+        table = means.melt(var_name="metric", ignore_index=False).reset_index()
+    if name in TIMES:
+        table = _with_interval_of_median(table)
+    for needed in (*keys, "value"):
+        if needed not in table:
+            raise ValueError(f"{where}: needs a column {needed!r}, it has {', '.join(map(str, table.columns))}")
+    undefined = {bound: float("nan") for bound in ("low", "high") if bound not in table}  # nothing was repeated
+    table = table[table["value"].notna()].assign(**undefined)
+    astray = ~np.isfinite(table["value"]) | (table["low"] > table["value"]) | (table["high"] < table["value"])
+    faults = {
+        "a figure that is infinite or outside its interval": astray,
+        "two rows": table.duplicated([*keys, *{"seed", "length"} & {*table}]),
+    }
+    if name == "quality" and "unit" in table:
+        wanted = table["metric"].map({metric: unit for metric, (unit, _) in NINE_METRICS.items()})
+        unlike = wanted.notna() & (table["unit"].astype(object).fillna("") != wanted)
+        faults["another unit than the paper"] = unlike
+    for fault, rows in faults.items():
+        if rows.any():
+            raise ValueError(f"{where}: has {fault} of {', '.join(map(str, table.loc[rows, keys].iloc[0]))}")
+    for model in table["model"].unique() if "model" in table else ():
+        if model not in others:
+            check_model(model, where)
+    if "device" in table and not set(table["device"]) <= {"CPU", "GPU"}:
+        raise ValueError(f"{where}: device must be CPU or GPU, got {table['device'].unique()}")
+    return table
+
+
+def check_model(model: str, where: str) -> None:
+    """Raise ValueError for a name that is neither a preset's own nor one of `REFERENCE_ROWS`."""
+    try:
+        known = model in REFERENCE_ROWS or presets.find_preset(model).name == model
+    except ValueError:
+        known = False
+    if not known:
+        raise ValueError(f"{where}: unknown model {model!r}{nearest_hint(model, [*presets.PRESETS, *REFERENCE_ROWS])}")
+
+
+# ----------------------------------------------------------------------------------------- what is missing
 
 
 class NotMeasured(LookupError):
@@ -201,11 +287,11 @@ class Evidence:
             which = np.logical_and.reduce(wanted)
             table = table[which] if which.any() else table[:0]  # most of what is asked was not measured
         trained = not self.printed and len(table) > 0
-        if trained and name in OF_TRAINED_NETWORKS and row.get("model", "real") not in printed.REFERENCE_ROWS:
+        if trained and name in OF_TRAINED_NETWORKS and row.get("model", "real") not in REFERENCE_ROWS:
             model, seeds = asked_network(row["model"]), int(table["seeds"].min())
             self.networks.append(Network(model, model, row.get("window_frames", 32), seeds=seeds))
-        if trained and name in printed.OF_TEXT:
-            keys, timed = [key for key in printed.SCHEMAS[name] if key != "metric"], row.get("metric") in OF_TIME
+        if trained and name in OF_TEXT:
+            keys, timed = [key for key in SCHEMAS[name] if key != "metric"], row.get("metric") in OF_TIME
             for one in table[table["windows"] > 0].to_dict("records"):  # real motion saw none
                 about = {"seeds": one["seeds"], "windows": one["windows"], "parameters": one.get("parameters", 0)}
                 named = tuple((key, one[key]) for key in keys)
@@ -279,36 +365,13 @@ def recorded_evidence(root, dataset: str, profile: str) -> Evidence:
         if reason := folder_reason(path, record):
             raise NotMeasured(f"{name}.csv {reason}: measure it again")
         others = [one for paper in paper_folders() for one in load_paper_file("paper", paper).get("others", ())]
-        table = printed.checked_table(name, table, str(path), others if name in printed.OF_TEXT else ())
-        if name in (*OF_TRAINED_NETWORKS, *printed.OF_TEXT):
-            if not len(table := of_seeds(table, printed.SCHEMAS[name], length)):
+        table = checked_table(name, table, str(path), others if name in OF_TEXT else ())
+        if name in (*OF_TRAINED_NETWORKS, *OF_TEXT):
+            if not len(table := of_seeds(table, SCHEMAS[name], length)):
                 raise NotMeasured(f"{name}.csv has nothing after {length:g} of the usual length")
         return table, record, path.relative_to(root).as_posix()
 
     return Evidence(load, at=lambda share: Evidence(functools.partial(load, length=share)))
-
-
-def committed_quality(dataset: str) -> pd.DataFrame | None:
-    """Return what is on record for the models of a data set, with the weights of each row.
-
-    Means and intervals of the protocol, and of `measure walking` (its intervals are over seeds).
-    """
-    tables, keys = [], ["model", "window_frames", "steps"]
-    if found := committed_table(dataset, "quality"):
-        weights = committed_table(dataset, "quality_by_seed")[0][[*keys, "weights"]].drop_duplicates(keys)
-        tables.append(found[0].merge(weights, on=keys, how="left"))
-    if found := committed_table(dataset, "walking"):
-        tables.append(_walking_rows(found[0]))
-    return pd.concat(tables, ignore_index=True) if tables else None
-
-
-def _walking_rows(walking: pd.DataFrame) -> pd.DataFrame:
-    """Sum `records/walking.csv` up in the form of the protocol's table."""
-    # The protocol has its own acceleration.
-    figures = [one.name for one in SHOWN["card"] if one.name in walking and one.name != "joint_acceleration"]
-    columns = ["model", "window_frames", "steps", "weights"]
-    means = walking.fillna({"weights": ""}).groupby([*columns, "seed"], sort=False)[figures].mean().reset_index()
-    return intervals_over_repeats(means.melt([*columns, "seed"], var_name="metric"), [*columns, "metric"])
 
 
 def of_seeds(table: pd.DataFrame, keys: Sequence[str], length: float = 1.0) -> pd.DataFrame:
@@ -364,24 +427,24 @@ def snapshot_evidence(root, dataset: str, profile: str) -> list[Evidence]:
         most = f"1 to {trainings.max()} trainings" if trainings.max() > 1 else "one training"
         where = f"{place} at {windows:,} windows, {most} a network"
         seen = trainings.reset_index().assign(metric="windows", value=windows)
-        tables = {"quality": intervals_over_repeats(rows, [*printed.SCHEMAS["quality"], "unit"]), "trained": seen}
+        tables = {"quality": intervals_over_repeats(rows, [*SCHEMAS["quality"], "unit"]), "trained": seen}
         of_recipes = errors[errors["windows"] == windows]
-        tables["recipe_errors"] = intervals_over_repeats(of_recipes, printed.SCHEMAS["recipe_errors"])
+        tables["recipe_errors"] = intervals_over_repeats(of_recipes, SCHEMAS["recipe_errors"])
         tables = {name: one.rename(columns={"repeats": "seeds"}) for name, one in tables.items() if len(one)}
-        tables = {name: printed.checked_table(name, one, where) for name, one in tables.items()}
+        tables = {name: checked_table(name, one, where) for name, one in tables.items()}
         at = lambda share, windows=windows: by_length.get(share * windows)
         by_length[windows] = _evidence_of(tables, record, where, gap, at=at)
-    curves = printed.checked_table("quality_by_epoch", _learning_curves(table), place)
+    curves = checked_table("quality_by_epoch", _learning_curves(table), place)
     return [*by_length.values(), _evidence_of({"quality_by_epoch": curves} if len(curves) else {}, record, place, gap)]
 
 
 def _learning_curves(rows: pd.DataFrame) -> pd.DataFrame:
     """Return, of rows of the long queue, those of each model's run with most snapshots, if it has two or more."""
-    rows = rows[rows["metric"].isin([*printed.NINE_METRICS, "held_out_loss"]) & (rows["window_frames"] == 32)]
+    rows = rows[rows["metric"].isin([*NINE_METRICS, "held_out_loss"]) & (rows["window_frames"] == 32)]
     rows = rows[rows["steps"].isin([0, 8])].rename(columns={"epochs": "epoch"})  # the loss has no steps
     lengths = rows.groupby(["model", "run"])["windows"].nunique()
     longest = lengths[lengths > 1].sort_values().reset_index().drop_duplicates("model", keep="last")["run"]
-    return rows.loc[rows["run"].isin(longest), [*printed.SCHEMAS["quality_by_epoch"], "value"]]
+    return rows.loc[rows["run"].isin(longest), [*SCHEMAS["quality_by_epoch"], "value"]]
 
 
 @functools.cache
@@ -391,6 +454,8 @@ def paper_evidence(paper: str = "f3amd") -> Evidence:
     Raises:
       ValueError: if two tables print different figures of one row, or one is of no known form.
     """
-    record = {"paper_setting": load_paper_file("paper", paper)["setting"]}
-    where, gap = "the paper's tables", "the paper has no table of it"
-    return _evidence_of(printed.printed_tables(paper), record, where, gap, framework="iree")
+    about, where = load_paper_file("paper", paper), "the paper's tables"
+    tables, others = printed_tables(paper), about.get("others", ())
+    tables = {name: checked_table(name, table, f"the paper's {name}", others) for name, table in tables.items()}
+    record = {"paper_setting": about["setting"]}
+    return _evidence_of(tables, record, where, "the paper has no table of it", framework="iree")

@@ -25,10 +25,19 @@ from itertools import combinations, pairwise, product
 import numpy as np
 import pandas as pd
 
-from f3amd_companion.ledger.evidence import Evidence, Figure, NotMeasured, known, mean_figure, power_law, ratio
+from f3amd_companion.ledger.evidence import (
+    NINE_METRICS,
+    Evidence,
+    Figure,
+    NotMeasured,
+    known,
+    mean_figure,
+    power_law,
+    ratio,
+)
 from f3amd_lib.measures.distributions import mean_and_interval
 from f3amd_lib.measures.registry import METRICS
-from f3amd_lib.papers.printed import NINE_METRICS, PUBLISHED_CAMDM
+from f3amd_lib.papers.printed import PUBLISHED_CAMDM
 
 HOLDS = "holds"
 IN_PART = "holds in part"

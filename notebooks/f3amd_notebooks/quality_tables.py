@@ -15,6 +15,7 @@ import numpy as np
 import pandas as pd
 from f3amd_lib.ground.names import row_label
 from f3amd_lib.ground.papers import load_paper_table
+from f3amd_lib.ground.stored import committed_table
 from f3amd_lib.ground.tables import figure_text, markdown_table
 from f3amd_lib.measures.distributions import intervals_over_repeats
 from f3amd_lib.measures.registry import SHOWN
@@ -253,3 +254,26 @@ def _heading(metric: str, unit, better: str) -> str:
     if isinstance(unit, str) and unit:
         heading += f" ({unit})"
     return heading + ARROWS.get(better, "")
+
+
+def committed_quality(dataset: str) -> pd.DataFrame | None:
+    """Return what is on record for the models of a data set, with the weights of each row.
+
+    Means and intervals of the protocol, and of `measure walking` (its intervals are over seeds).
+    """
+    tables, keys = [], ["model", "window_frames", "steps"]
+    if found := committed_table(dataset, "quality"):
+        weights = committed_table(dataset, "quality_by_seed")[0][[*keys, "weights"]].drop_duplicates(keys)
+        tables.append(found[0].merge(weights, on=keys, how="left"))
+    if found := committed_table(dataset, "walking"):
+        tables.append(_walking_rows(found[0]))
+    return pd.concat(tables, ignore_index=True) if tables else None
+
+
+def _walking_rows(walking: pd.DataFrame) -> pd.DataFrame:
+    """Sum `records/walking.csv` up in the form of the protocol's table."""
+    # The protocol has its own acceleration.
+    figures = [one.name for one in SHOWN["card"] if one.name in walking and one.name != "joint_acceleration"]
+    columns = ["model", "window_frames", "steps", "weights"]
+    means = walking.fillna({"weights": ""}).groupby([*columns, "seed"], sort=False)[figures].mean().reset_index()
+    return intervals_over_repeats(means.melt([*columns, "seed"], var_name="metric"), [*columns, "metric"])
