@@ -21,7 +21,7 @@ export F3AMD_PYTHON
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install figures smoke course measure bench bench-tools test test-slow test-long test-all test-extras test-web coverage web-tools \
+.PHONY: help install figures smoke course measure bench bench-tools test test-slow test-long test-all test-extras test-web web-tools \
   lint lab clean site site-tools onnx-tools sweep-tools
 
 help: ## Show this list
@@ -86,7 +86,7 @@ test-slow: $(INSTALLED) ## Run the slow tests and notebooks that `make test` lea
 	$(PYTEST) $(NO_NOTEBOOKS) $(SIDE_BY_SIDE) $(call MARKED,slow, and not long) $(PYTEST_OPTIONS)
 	$(call COMPARED,$(filter-out $(FIRST_NOTEBOOKS),$(NOTEBOOKS)))
 
-test-long: $(INSTALLED) ## Rehearse all commands of the ledger at smoke size, and the notebooks with other seeds
+test-long: $(INSTALLED) ## Rehearse all commands of the ledger at smoke size, and the notebooks with another seed
 	$(PYTEST) $(NO_NOTEBOOKS) $(SIDE_BY_SIDE) $(call MARKED,long) $(PYTEST_OPTIONS)
 
 test-all: test test-slow test-long test-extras site test-web ## All tests there are, with the site and the browser
@@ -95,12 +95,6 @@ test-all: test test-slow test-long test-extras site test-web ## All tests there 
 # the marker `needs`.
 test-extras: bench-tools onnx-tools sweep-tools ## Test what needs PyTorch, IREE, ONNX Runtime or Dask
 	$(PYTEST) $(NO_NOTEBOOKS) $(SIDE_BY_SIDE) $(call MARKED,needs) $(PYTEST_OPTIONS)
-
-coverage: $(INSTALLED) ## Say which lines of the library the tests leave out, the slow tests among them (long)
-	$(PYTHON) -m coverage erase
-	$(PYTEST:pytest=coverage run -m pytest) tests $(SIDE_BY_SIDE) -m "not long" --ignore tests/web $(PYTEST_OPTIONS)
-	$(PYTHON) -m coverage combine --quiet
-	$(PYTHON) -m coverage report
 
 # The browser is the system's own: as root on Debian it is installed, elsewhere named.
 web-tools: $(VENV)/extra-web ## Add selenium to .venv, and Chromium to the system if it is missing
@@ -128,6 +122,6 @@ lab: $(INSTALLED) ## Open the notebook beside the paper in JupyterLab
 	$(PYTHON) -m jupyterlab --notebook-dir=. --LabApp.default_url=/lab/tree/notebooks/00_beside_the_paper.ipynb $(LAB_OPTIONS)
 
 clean: ## Remove caches and build leftovers; keeps .venv, data/, runs/, paper_figures/
-	rm -rf build dist docs/_build .pytest_cache .ruff_cache .coverage* ./*.egg-info
+	rm -rf build dist docs/_build .pytest_cache .ruff_cache ./*.egg-info
 	find . \( -path ./.venv -o -path ./$(VENV) -o -path ./.git -o -path ./data -o -path ./runs -o -path ./paper_figures \) \
 	  -prune -o -type d \( -name __pycache__ -o -name .pytest_cache \) -exec rm -rf {} +

@@ -27,7 +27,7 @@ from f3amd_companion.serving import steer  # noqa: E402 (the line above is what 
 from f3amd_companion.serving.onnx_export import denoiser_program, model_card  # noqa: E402
 from f3amd_companion.serving.player import describe_for_web, read_web  # noqa: E402
 from f3amd_lib.data.features import frame_yaw  # noqa: E402
-from f3amd_lib.ground.stored import committed_table  # noqa: E402
+from f3amd_lib.ground.records import committed_table  # noqa: E402
 
 NOTEBOOK, FIGURES = "00_beside_the_paper", ("noise", "steps", "ladder")
 CELLS = ("path-01", "path-02", "path-03", "path-07", "path-08")  # up to a window, its condition and two draws of noise

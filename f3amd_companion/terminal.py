@@ -12,6 +12,8 @@ import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
+from f3amd_lib.ground.profiles import PRETRAINED_DIR, load_profile, runs_dir
+
 log = logging.getLogger("f3amd")
 
 
@@ -109,3 +111,26 @@ def leave_on_ctrl_c(says: str, at_once: bool) -> None:
         leave(says)
 
     threading.Thread(target=watch, daemon=True).start()
+
+
+def find_model(dataset: str) -> Path:
+    """Return the weights to use for a data set: the user's own gpu or laptop run, else shipped.
+
+    Of several presets the profile's own comes first, then the newest.
+
+    Raises:
+      ValueError: if there are none, saying how to train them.
+    """
+    for profile, folder in (
+        ("gpu", runs_dir(dataset, "gpu") / "models"),
+        ("laptop", runs_dir(dataset, "laptop") / "models"),
+        ("laptop", PRETRAINED_DIR / dataset),
+    ):
+        first = folder / f"{load_profile(profile, dataset).preset}.safetensors"
+        models = [path for path in folder.glob("*.safetensors") if "." not in path.stem]  # no state, nothing set aside
+        if models:
+            return first if first in models else max(models, key=lambda path: path.stat().st_mtime)
+    raise ValueError(
+        f"no trained model for data set {dataset!r}: run `f3amd train --data "
+        f"{dataset}` (or `make figures DATA={dataset}`) first, or pass --weights"
+    )

@@ -27,12 +27,11 @@ from f3amd_companion.ledger.claims import (
     ledger,
     ledger_path,
     load_claims,
-    papers_with_claims,
     scale,
     verdicts_of,
 )
 from f3amd_lib.ground.files import read_toml, write_whole
-from f3amd_lib.ground.papers import load_paper_file
+from f3amd_lib.ground.papers import has_paper_file, load_paper_file, paper_folders
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.tables import compact_table, markdown_table
 
@@ -153,6 +152,11 @@ def write_ledger(path: Path, judgements: Sequence[Judgement], *, accept: bool = 
         kept = json.dumps(verdicts_of(frame), indent=2, ensure_ascii=False)
         write_whole(path.with_suffix(".json"), f"{kept}\n")
     return changes
+
+
+def papers_with_claims() -> list[str]:
+    """Return the folders of the papers that have a ledger."""
+    return [name for name in paper_folders() if has_paper_file("claims", name)]
 
 
 def main() -> int:

@@ -24,8 +24,7 @@ from f3amd_notebooks.quality_tables import committed_quality
 from f3amd_lib.ground.files import read_toml, write_whole
 from f3amd_lib.ground.names import counted_cores
 from f3amd_lib.ground.papers import load_paper_file
-from f3amd_lib.ground.records import read_table
-from f3amd_lib.ground.stored import committed_table
+from f3amd_lib.ground.records import committed_table, read_table
 from f3amd_lib.ground.tables import figure_text, markdown_table
 from f3amd_lib.ground.trees import describe, weights_digest
 from f3amd_lib.measures.registry import METRICS, SHOWN, Metric

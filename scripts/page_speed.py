@@ -24,7 +24,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this tree's libr
 from f3amd_companion.serving.steer import write_steer
 from f3amd_companion.speed.machine import describe_machine
 from f3amd_companion.speed.timing import take_turns
-from f3amd_lib.ground.profiles import find_model
+from f3amd_companion.terminal import find_model
 from f3amd_lib.ground.records import read_table, run_record, write_table
 from f3amd_lib.ground.tables import markdown_table
 from f3amd_lib.training.checkpoints import load_model

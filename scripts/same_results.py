@@ -44,9 +44,11 @@ from f3amd_notebooks.beside_printed import beside_printed, speedups_by_turns, ti
 from f3amd_notebooks.equation_map import equation_map
 from f3amd_notebooks.quality_tables import QUALITY_TABLES, committed_quality, of_queue, quality_markdown
 from f3amd_notebooks.readings import readings_table
+from f3amd_notebooks.speed_bars import speed_bars
 
 from f3amd_companion.ledger.claims import judge_claims, ledger
 from f3amd_companion.measuring.consistency_task import distil
+from f3amd_companion.measuring.times import fastest_implementations
 from f3amd_companion.serving.artefact import JAX_EXPORT, MANIFEST, STABLEHLO, load_artefact
 from f3amd_companion.serving.crowd import generate_crowd
 from f3amd_companion.serving.export import export_model
@@ -55,14 +57,12 @@ from f3amd_companion.serving.motion_files import write_glb, write_motion_csv
 from f3amd_companion.serving.onnx_export import export_onnx, load_text_or_latent, model_card
 from f3amd_companion.serving.player import player_page, rollout_scene
 from f3amd_companion.speed.machine import describe_machine
-from f3amd_companion.speed.speed_tables import fastest_implementations, speed_bars
 from f3amd_lib.data.packed import CACHE_DIR_VARIABLE, pack
 from f3amd_lib.data.sources import open_dataset
 from f3amd_lib.diffusion.schedules import straight, variance_preserving_betas
 from f3amd_lib.ground.papers import load_paper_file, paper_folders
 from f3amd_lib.ground.profiles import load_profile, repository_root
-from f3amd_lib.ground.records import read_table
-from f3amd_lib.ground.stored import committed_table
+from f3amd_lib.ground.records import committed_table, read_table
 from f3amd_lib.measures.classifier import train_classifier
 from f3amd_lib.measures.metrics import camdm_metrics, first_metrics
 from f3amd_lib.measures.walking import walking_figures, walking_measures

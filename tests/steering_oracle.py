@@ -25,8 +25,7 @@ from f3amd_lib.data.features import bend_path, center_window, orthonormalise, pa
 from f3amd_lib.motion.rotations import wrap_angle
 from f3amd_lib.networks.conditioning import Condition
 from f3amd_lib.rollout.blending import blend_seams
-from f3amd_lib.rollout.rollout import MotionGenerator
-from f3amd_lib.rollout.start_poses import pose_speed
+from f3amd_lib.rollout.rollout import MotionGenerator, pose_speed
 from f3amd_lib.training.checkpoints import TrainedModel
 
 FPS = 30.0

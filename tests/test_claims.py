@@ -43,8 +43,7 @@ from f3amd_companion.ledger.judgements import (
     stated_factor,
     within,
 )
-from f3amd_lib.ground.records import write_table
-from f3amd_lib.ground.stored import committed_table
+from f3amd_lib.ground.records import committed_table, write_table
 from f3amd_lib.networks.attention import TransformerBlock
 from f3amd_lib.networks.spectral import FNOBlock
 

@@ -21,7 +21,7 @@ from f3amd_companion.measuring import times as measurements
 from f3amd_companion.serving import motion_files
 from f3amd_companion.serving.crowd import read_crowd
 from f3amd_companion.serving.crowd_planning import closest_approach
-from f3amd_companion.speed import machine, speed_tables
+from f3amd_companion.speed import machine
 from f3amd_companion.terminal import Lines
 from f3amd_lib.motion.bvh import read_bvh
 from f3amd_lib.training.checkpoints import save_model
@@ -368,25 +368,10 @@ def test_without_a_terminal_progress_is_few_plain_lines(capsys, quiet, expected)
 
 
 def test_quiet_leaves_warnings_alone(caplog, monkeypatch):
-    say = lambda *words: logging.getLogger("f3amd").info("news") or logging.getLogger("f3amd").warning("beware") or 0
-    monkeypatch.setattr("f3amd_companion.ledger.claims.main", say)
-    assert [main(["claims", "--quiet"]), main(["claims"])] == [0, 0]
+    say = lambda *_, **__: logging.getLogger("f3amd").info("news") or logging.getLogger("f3amd").warning("beware") or 0
+    monkeypatch.setattr("f3amd_companion.reproduce.run_course", say)
+    assert [main(["course", "--quiet"]), main(["course"])] == [0, 0]
     assert caplog.messages == ["beware", "news", "beware"]
-
-
-@pytest.mark.parametrize("met, status", [(["yes", "not measured"], 0), (["yes", "no"], 1)])
-def test_a_missed_bar_is_the_status_of_bench(no_fast_flags, monkeypatch, tmp_path, met, status):
-    monkeypatch.setattr("f3amd_lib.training.pipeline.prepare", lambda profile, **how: None)
-    monkeypatch.setattr(measurements, "measure_synthesis_time", lambda *a, **k: tmp_path / "table.csv")
-    monkeypatch.setattr("f3amd_lib.ground.records.read_table", lambda path: (None, {}))
-    monkeypatch.setattr(speed_tables, "speed_bars", lambda table, suite: pd.DataFrame({"met": met}))
-    assert main(["bench", "--suite", "bars"]) == status
-
-
-def test_claims_outside_a_clone_say_where_to_run_them(monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr("f3amd_companion.ledger.claims.repository_root", lambda: tmp_path)
-    assert main(["claims"]) == 2
-    assert "run this in a clone of the repository" in capsys.readouterr().err
 
 
 @pytest.mark.slow

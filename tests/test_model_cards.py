@@ -16,7 +16,7 @@ from page_tables import fill_tables
 
 from f3amd_companion.__main__ import main
 from f3amd_lib.ground.profiles import repository_root
-from f3amd_lib.ground.stored import committed_table
+from f3amd_lib.ground.records import committed_table
 from f3amd_lib.ground.trees import describe, weights_digest
 from f3amd_lib.motion import synthetic
 from f3amd_lib.networks import presets

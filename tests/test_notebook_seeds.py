@@ -1,6 +1,6 @@
-"""Notebooks run with other seeds too: what they say must not hang on the one that was committed.
+"""Notebooks run with another seed too: what they say must not hang on the one that was committed.
 
-Seed 0 is what nbval runs. A copy of the repository keeps the runs of these seeds apart from the reader's own.
+Seed 0 is what nbval runs. A copy of the repository keeps the runs of this seed apart from the reader's own.
 """
 
 import os
@@ -29,17 +29,16 @@ def copy(tmp_path_factory) -> Path:
 
 
 NOTEBOOKS = reproduce.find_notebooks(ROOT / "notebooks")
-RUNS = [(path, seed) for path in NOTEBOOKS for seed in (1, 2)]
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("path", "seed"), RUNS, ids=lambda value: getattr(value, "stem", value))
-def test_notebooks_run_with_any_seed(copy, path, seed, tmp_path, monkeypatch):
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_notebooks_run_with_another_seed(copy, path, tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", f"{copy}{os.pathsep}{copy / 'notebooks'}")
     monkeypatch.setenv(profiles.RESULTS_DIR_VARIABLE, str(tmp_path / "results"))
     # As a reader runs them, not as the other tests do.
     monkeypatch.delenv("JAX_DISABLE_MOST_OPTIMIZATIONS", raising=False)
     papermill.execute_notebook(
-        str(copy / "notebooks" / path.name), str(tmp_path / path.name), parameters={"profile": "smoke", "seed": seed},
+        str(copy / "notebooks" / path.name), str(tmp_path / path.name), parameters={"profile": "smoke", "seed": 1},
         kernel_name=reproduce.KERNEL, cwd=str(copy / "notebooks"), progress_bar=False,
     )  # fmt: skip

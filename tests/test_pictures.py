@@ -7,7 +7,8 @@ from builders import stiff_walk, wandering_motion
 from matplotlib.collections import LineCollection
 from matplotlib.colors import to_hex
 
-from f3amd_lib.drawing.pictures import crowd_figure, film_strip
+from f3amd_companion.serving.finishing import crowd_figure
+from f3amd_lib.drawing.pictures import film_strip
 from f3amd_lib.drawing.stick_figures import LIMB_COLORS, Camera
 from f3amd_lib.drawing.style import keep_figure, new_figure
 from f3amd_lib.motion.skeleton import turn

@@ -8,15 +8,15 @@ from builders import CHANNELS, HISTORY, refused, tiny_trained, wandering_motion
 from strangers import cmu_skeleton
 from test_skeleton import BANDAI
 
+from f3amd_companion.serving.motion_files import start_history
+from f3amd_companion.terminal import find_model
 from f3amd_lib.data.features import frame_positions, frame_yaw, motion_from_frames
-from f3amd_lib.ground.profiles import find_model
 from f3amd_lib.motion.anatomy import joint_roles
 from f3amd_lib.motion.plausible import as_person
 from f3amd_lib.motion.retarget import DOUBTFUL, retarget
 from f3amd_lib.motion.root_paths import named_path
 from f3amd_lib.motion.skeleton import Motion, resample
 from f3amd_lib.motion.synthetic import synthesize
-from f3amd_lib.rollout.start_poses import start_history
 from f3amd_lib.training.checkpoints import load_model
 
 

@@ -4,8 +4,9 @@ import numpy as np
 import pandas as pd
 from builders import refused
 from f3amd_notebooks.beside_printed import speedups_by_turns, times_beside_paper, training_beside_paper
+from f3amd_notebooks.speed_bars import speed_bars
 
-from f3amd_companion.speed import speed_tables
+from f3amd_companion.measuring.times import fastest_implementations
 from f3amd_lib.ground.papers import load_paper_table
 
 
@@ -31,7 +32,7 @@ GOOD = (
 
 
 def test_bars_take_the_fastest_way_and_say_what_is_met():
-    bars = speed_tables.speed_bars(measured(*GOOD)).set_index("what")
+    bars = speed_bars(measured(*GOOD)).set_index("what")
     by_place = bars["measured"].tolist()
     np.testing.assert_allclose(by_place, [0.7, 0.6, 0.8, 0.9, 60.0, 7.5, 50.0, 0.5])
     assert bars["met"].tolist() == ["yes", "no", "yes", "yes", "yes", "yes", "yes", "no"]
@@ -48,7 +49,7 @@ def test_fastest_way_of_each_framework_in_float32():
     )
     columns = ["model", "steps", "framework", "way", "characters", "value", "precision"]
     table = pd.DataFrame(rows, [0] * len(rows), columns)  # an index as pieces of several runs have
-    found = speed_tables.fastest_implementations(table.assign(window_frames=32, device="CPU", suite="main"))
+    found = fastest_implementations(table.assign(window_frames=32, device="CPU", suite="main"))
     assert list(found["value"]) == [2.0, 4.0, 0.7]
     assert list(found["way"]) == ["jit, all devices", "PyTorch", "jit"]
 
@@ -58,7 +59,7 @@ def test_speedups_take_both_times_from_the_same_turns():
     bars = measured(("CAMDM", 8, "jit", 32, 900.0, 0.8), ("F3AMD-FNO-96", 8, "jit", 32, 30.0, 0.6))
     family = measured(("CAMDM", 8, "jit", 32, 500.0, 0.8), ("F3AMD-FNO-64", 8, "jit", 32, 50.0, 0))
     table = pd.concat([bars.assign(suite="bars"), family.assign(suite="family"), main])
-    found = speedups_by_turns(table, speed_tables.fastest_implementations).set_index("model")["speedup"]
+    found = speedups_by_turns(table, fastest_implementations).set_index("model")["speedup"]
     assert found.to_dict() == {"F3AMD-FNO-96": 10.0, "F3AMD-FNO-64": 10.0}
 
 

@@ -8,9 +8,10 @@ from builders import refused
 from strangers import NAMES, NAMINGS, REFUSED, bvh_cases, cmu_skeleton, walker
 
 from f3amd_companion.__main__ import main
+from f3amd_companion.serving.motion_files import read_joint_map
 from f3amd_lib.motion.anatomy import joint_roles, leg_length, side_of, twin_name
 from f3amd_lib.motion.bvh import parse_bvh
-from f3amd_lib.motion.plausible import as_person, call_by_roles, read_joint_map
+from f3amd_lib.motion.plausible import as_person, call_by_roles
 from f3amd_lib.motion.skeleton import Motion, Skeleton
 
 CASES = bvh_cases()

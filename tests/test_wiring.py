@@ -23,8 +23,7 @@ from f3amd_lib.data.features import Normaliser, world_frames
 from f3amd_lib.data.windows import gather_windows
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.motion.root_paths import named_path
-from f3amd_lib.rollout.rollout import MotionGenerator
-from f3amd_lib.rollout.start_poses import starting_poses
+from f3amd_lib.rollout.rollout import MotionGenerator, starting_poses
 from f3amd_lib.training import denoising_task as task_module
 from f3amd_lib.training import pipeline
 from f3amd_lib.training.optimise import TrainingState, advance, held_out_terms, initial_state

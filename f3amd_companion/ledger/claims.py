@@ -1,4 +1,4 @@
-"""The claims ledger: what a paper says, judged from records: `f3amd claims`.
+"""The claims ledger: what a paper says, judged from records. `scripts/claims_page.py` writes the pages.
 
 Every claim is an entry of the paper's `claims.toml`: its sentence in our words, its place in the
 paper, what decides it, and its statements, each with its kind of judgement. A verdict
@@ -34,8 +34,7 @@ from f3amd_companion.ledger.evidence import (
     snapshot_evidence,
 )
 from f3amd_companion.ledger.gate import why_not_judged
-from f3amd_lib.ground import log
-from f3amd_lib.ground.papers import check_entry, find_entry, has_paper_file, load_paper_file, paper_folders
+from f3amd_lib.ground.papers import check_entry, find_entry, load_paper_file
 from f3amd_lib.ground.profiles import repository_root
 from f3amd_lib.measures.registry import METRICS
 from f3amd_lib.papers.printed import SCHEMAS
@@ -369,11 +368,6 @@ def statement_table(judgement: Judgement) -> pd.DataFrame:
     return found.reindex(list(says)).dropna(how="all").fillna("").rename(says).rename_axis("statement").reset_index()
 
 
-def papers_with_claims() -> list[str]:
-    """Return the folders of the papers that have a ledger."""
-    return [name for name in paper_folders() if has_paper_file("claims", name)]
-
-
 def ledger_path(paper: str = "f3amd") -> Path:
     """Return where a paper's ledger is committed; its accepted verdicts lie beside it as JSON."""
     return repository_root() / "paper_figures" / ("claims.md" if paper == "f3amd" else f"claims_{paper}.md")
@@ -413,28 +407,3 @@ def changed_verdicts(frame: pd.DataFrame, accepted: Mapping[str, Mapping[str, st
         if (was := accepted.get(name, {}).get(f"{side}verdict", "not accepted yet")) != now[f"{side}verdict"]
     ]
     return changes + [f"{name}: is no claim any more" for name in accepted if name not in verdicts]
-
-
-def main(paper: str | None = None) -> int:
-    """Judge the papers' claims from records, and say which verdicts are not the accepted ones.
-
-    Args:
-      paper: whose claims; each paper's if none.
-
-    Returns:
-      Exit status: 1 if a verdict changed.
-
-    Raises:
-      ValueError: outside a clone of the repository, where the records lie.
-    """
-    status, folder = 0, ledger_path().parent
-    if not folder.is_dir():
-        raise ValueError(f"{folder}: has no records; run this in a clone of the repository")
-    for name in papers_with_claims() if paper is None else [paper]:
-        frame, path = ledger(judge_claims(paper=name)), ledger_path(name)
-        counts = frame["verdict"].value_counts().items()
-        log.info("%-12s %s", name, ", ".join(f"{count} {verdict}" for verdict, count in counts))
-        for change in changed_verdicts(frame, accepted_verdicts(path)):
-            log.error("%s", change)
-            status = 1
-    return status

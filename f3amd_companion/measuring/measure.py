@@ -18,7 +18,10 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+import optax
 import pandas as pd
 
 from f3amd_companion.measuring import sensitivity
@@ -27,22 +30,16 @@ from f3amd_companion.measuring.runner import Records, record_of, records_folder
 from f3amd_companion.measuring.times import Candidate, time_group
 from f3amd_companion.serving.foot_locking import lock_rollout
 from f3amd_lib.data.packed import PackedMotion
+from f3amd_lib.data.windows import WindowSet, spread_windows
 from f3amd_lib.ground import log
 from f3amd_lib.ground.names import asked_network
 from f3amd_lib.ground.profiles import Profile, runs_dir
 from f3amd_lib.ground.records import run_record, write_table
 from f3amd_lib.ground.trees import weights_digest
 from f3amd_lib.measures import denoising
+from f3amd_lib.measures import protocol as protocols
 from f3amd_lib.measures.classifier import StyleClassifier, obtain_classifier
-from f3amd_lib.measures.protocol import (
-    REFERENCE_MODELS,
-    Protocol,
-    evaluation_paths,
-    measure_model,
-    measure_real,
-    summarise,
-    windows_that_fit,
-)
+from f3amd_lib.measures.distributions import mean_and_interval
 from f3amd_lib.measures.real_clips import reference_clips, style_floor
 from f3amd_lib.measures.walking import walking_figures
 from f3amd_lib.motion.skeleton import Motion
@@ -52,6 +49,7 @@ from f3amd_lib.rollout.blending import blend_rollout
 from f3amd_lib.rollout.rollout import MotionGenerator
 from f3amd_lib.text.released import read_released
 from f3amd_lib.training.checkpoints import TrainedModel
+from f3amd_lib.training.denoising_task import DenoisingTask
 from f3amd_lib.training.pipeline import PreparedData, available_models, obtain_model
 from f3amd_lib.training.recipe import profile_recipe
 
@@ -137,14 +135,16 @@ def _real_walks(packed: PackedMotion, profile: Profile, styles: list[str]) -> li
     return [(packed.styles[packed.clip_style[clip]], packed.motion(clip)) for clip in clips]
 
 
-def protocol_of(prepared: PreparedData, profile: Profile, measurement: str) -> tuple[StyleClassifier, Protocol, dict]:
+def protocol_of(
+    prepared: PreparedData, profile: Profile, measurement: str
+) -> tuple[StyleClassifier, protocols.Protocol, dict]:
     """Return the style classifier, the protocol of a profile and the record of a measurement."""
     packed = prepared.packed
     classifier, _ = obtain_classifier(packed, profile)
-    protocol = Protocol(
+    protocol = protocols.Protocol(
         tuple(_styles(prepared, profile)), num_frames=profile.rollout_frames, **_PROTOCOL.get(profile.name, {})
     )
-    fitting = windows_that_fit(packed, classifier, protocol, window=profile.window)
+    fitting = protocols.windows_that_fit(packed, classifier, protocol, window=profile.window)
     protocol = dataclasses.replace(protocol, windows_per_style=fitting)
     record = run_record(
         profile=profile, dataset=packed, seed=protocol.path_seed, measurement=measurement,
@@ -176,7 +176,7 @@ def measure_quality(
     if not trained:
         where = profile.dataset, profile.name
         log.warning("no trained model of %s at %s: only real motion is measured; name models with --model", *where)
-    todo = [(model, 0) for model in REFERENCE_MODELS]
+    todo = [(model, 0) for model in protocols.REFERENCE_MODELS]
     for name, model in trained.items():
         levels = len(getattr(model.config, "noise_levels", ()))
         counts = [steps for steps in STEPS if steps <= (levels or max(STEPS))]
@@ -190,15 +190,17 @@ def measure_quality(
             name = row["model"].removesuffix(LEADING)
             spacing = "endpoints" if name == row["model"] else "leading"
             generator = MotionGenerator(trained[name], row["steps"], spacing=spacing)
-            rows, tables["quality_by_round"] = measure_model(generator, packed, classifier, protocol, held_out)
+            rows, tables["quality_by_round"] = protocols.measure_model(
+                generator, packed, classifier, protocol, held_out
+            )
         else:
-            rows = measure_real(packed, classifier, protocol, window=profile.window, model=row["model"])
+            rows = protocols.measure_real(packed, classifier, protocol, window=profile.window, model=row["model"])
         return tables | {"quality_by_seed": rows.assign(seconds=round(time.perf_counter() - started, 1))}
 
     # Real motion has no weights, but it is seen through the classifier's.
     return _measure(
         profile, record, ["quality_by_seed", "quality_by_round"], _rows_of(profile, todo), score, again=models,
-        trained=trained, other=record["classifier_weights"], summary=summarise,
+        trained=trained, other=record["classifier_weights"], summary=protocols.summarise,
     )  # fmt: skip
 
 
@@ -244,7 +246,7 @@ def _measure_walks(
     packed, styles, made = prepared.packed, _styles(prepared, profile), prepared.packed.name == "synthetic"
     num_frames = max(2, profile.rollout_frames // 4 // profile.window) * profile.window
     floors = {style: 0.0 if made else style_floor(packed, style) for style in styles}
-    paths = {seed: evaluation_paths(packed, styles, num_frames, seed=seed) for seed in range(WALKING_SEEDS)}
+    paths = {seed: protocols.evaluation_paths(packed, styles, num_frames, seed=seed) for seed in range(WALKING_SEEDS)}
     record = record_of(profile, prepared.packed, name, num_frames=num_frames, num_seeds=WALKING_SEEDS, styles=styles)
     trained = _models(prepared, profile, models)
 
@@ -320,7 +322,7 @@ def measure_foot_spectrum(prepared: PreparedData, profile: Profile, models: Iter
       The table `records/foot_spectrum.csv` (see `sensitivity.foot_spectrum`).
     """
     styles, num_frames, trained = _styles(prepared, profile), profile.rollout_frames, _models(prepared, profile, models)
-    paths = evaluation_paths(prepared.packed, styles, num_frames, seed=profile.seed)
+    paths = protocols.evaluation_paths(prepared.packed, styles, num_frames, seed=profile.seed)
     real = _real_walks(prepared.packed, profile, styles)
 
     def listen(row: Mapping) -> dict:
@@ -343,7 +345,7 @@ def measure_noise_use(prepared: PreparedData, profile: Profile, models: Iterable
 
     Returns:
       The table `records/noise_use.csv`, a row per model and number of steps (see
-      `denoising.window_row`); beside it `x0_by_sigma.csv`, the x0 error against the noise level, at
+      `window_row`); beside it `x0_by_sigma.csv`, the x0 error against the noise level, at
       the levels that a model was told where it was told some, and `input_use.csv`, how far the
       estimates move with noisy input and noise level (see `denoising.input_use`).
     """
@@ -358,7 +360,7 @@ def measure_noise_use(prepared: PreparedData, profile: Profile, models: Iterable
         return {
             "x0_by_sigma": denoising.x0_error_by_sigma(model, held_out, levels),
             "input_use": denoising.input_use(model, condition, seed=profile.seed),
-            "noise_use": denoising.window_row(model, held_out, steps=steps, seed=profile.seed),
+            "noise_use": window_row(model, held_out, steps=steps, seed=profile.seed),
         }
 
     # The table that says what was measured is written last.
@@ -371,7 +373,7 @@ def measure_gradient_norm(prepared: PreparedData, profile: Profile, models: Iter
     """Measure the gradient of the loss that is not scaled against the noise level, at trained weights (claim T5).
 
     Returns:
-      The table `records/gradient_norm.csv` (see `denoising.gradient_norm_by_sigma`), of `F3AMD-FNO-96` by default.
+      The table `records/gradient_norm.csv` (see `gradient_norm_by_sigma`), of `F3AMD-FNO-96` by default.
     """
     trained = _models(prepared, profile, models or ["F3AMD-FNO-96"])
     held_out = prepared.windows(prepared.held_out_split)
@@ -379,7 +381,7 @@ def measure_gradient_norm(prepared: PreparedData, profile: Profile, models: Iter
     def slope(row: Mapping) -> dict:
         model, recipe = trained[row["model"]], profile_recipe(profile, row["model"])
         task = prepared.task(model.name, recipe, normaliser=model.normaliser)
-        levels = denoising.gradient_norm_by_sigma(task, model.params, held_out, SIGMAS, seed=profile.seed)
+        levels = gradient_norm_by_sigma(task, model.params, held_out, SIGMAS, seed=profile.seed)
         return {"gradient_norm": levels}
 
     record = record_of(profile, prepared.packed, "gradient_norm", sigmas=SIGMAS)
@@ -416,14 +418,14 @@ def measure_one_step(prepared: PreparedData, profile: Profile, models: Iterable[
             walker, _ = distil(prepared, profile, walker, folder / f"M{steps}", **settings)
             made |= {"spacing": STUDENT_SPACING}
         generator = MotionGenerator(walker, steps, **made)
-        rows, _ = measure_model(generator, packed, classifier, protocol, held_out, name=row["model"])
+        rows, _ = protocols.measure_model(generator, packed, classifier, protocol, held_out, name=row["model"])
         use = denoising.input_use(walker, denoising.held_out_condition(held_out, walker), seed=profile.seed)
         return {"one_step_input_use": use, "one_step_by_seed": rows}
 
     todo = [(name + DISTILLED, phases) for name in trained for phases in ONE_STEP_MODELS.get(name, (1,))]
     walks = [(name + BY_DDIM, TEACHER_STEPS) for name, model in trained.items() if model.diffusion.sampler != "ddim"]
     tables, rows = ["one_step_by_seed", "one_step_input_use"], _rows_of(profile, walks + todo)
-    return _measure(profile, record, tables, rows, score, again=models, trained=trained, summary=summarise)
+    return _measure(profile, record, tables, rows, score, again=models, trained=trained, summary=protocols.summarise)
 
 
 def measure_round_times(prepared: PreparedData, profile: Profile, models: Iterable[str] | None = None) -> Path:
@@ -456,3 +458,54 @@ MEASUREMENTS: dict[str, Callable] = {
     )
 }  # fmt: skip
 """Name -> function of (prepared data, profile, models or None) that returns its table's path."""
+
+
+def gradient_norm_by_sigma(task: DenoisingTask, params, windows: WindowSet, sigmas, *, seed: int = 0) -> pd.DataFrame:
+    """Measure how strongly a single window pulls at the weights at each noise level (claim T5).
+
+    Args:
+      task: whose loss is asked, the sum that it is trained on.
+      params: weights at which the gradient is taken.
+      windows: held-out windows; 64 of them are taken, one gradient each.
+      sigmas: noise levels, [N].
+      seed: of the noise, the same at every level.
+
+    Returns:
+      Columns sigma, value (mean over windows of the gradient's Euclidean norm), low, high (95 %), repeats.
+
+    Source: paper section 6 ("small-noise samples contribute little to the gradient").
+    """
+    batch = spread_windows(windows, 64)
+    keys = jax.random.split(jax.random.key(seed), batch.future.shape[0])
+
+    @jax.jit
+    def norms(sigma):
+        def of_one(given):
+            window, key = given
+            drawn = jax.tree.map(lambda leaf: leaf[None], window), sigma[None]
+            return optax.global_norm(jax.grad(lambda weights: task.loss(weights, None, drawn, key)[0])(params))
+
+        return jax.lax.map(of_one, (batch, keys))
+
+    rows = [{"sigma": float(sigma), **mean_and_interval(np.asarray(norms(jnp.float32(sigma))))} for sigma in sigmas]
+    return pd.DataFrame(rows)
+
+
+def window_row(trained: TrainedModel, windows: WindowSet, *, steps=(8, 1), seed: int = 0) -> pd.DataFrame:
+    """Measure what a model does with single held-out windows, and whether it uses its noise.
+
+    Args:
+      trained: the model.
+      windows: held-out.
+      steps: numbers of denoising steps.
+      seed: of the noise.
+
+    Returns:
+      A row per number of steps: steps, then the figures of `noise_use` and `window_quality`.
+    """
+    rows = []
+    for count in steps:
+        generator = MotionGenerator(trained, count)
+        figures = denoising.noise_use(generator, windows, seed=seed)
+        rows.append({"steps": count, **figures, **denoising.window_quality(generator, windows, seed=seed)})
+    return pd.DataFrame(rows)

@@ -23,7 +23,6 @@ from f3amd_companion.measuring.runner import Records, record_of, records_folder
 from f3amd_companion.speed import implementations
 from f3amd_companion.speed.implementations import Workload, jit_round
 from f3amd_companion.speed.machine import describe_machine, device_name, matmul_precision, prepared_at_once
-from f3amd_companion.speed.speed_tables import fastest_implementations
 from f3amd_companion.speed.timing import take_turns
 from f3amd_lib.ground import log
 from f3amd_lib.ground.files import read_toml
@@ -344,3 +343,30 @@ def measure_round_parts(prepared: PreparedData, profile: Profile) -> Path:
     tables = [time_breakdown(Workload("F3AMD-FNO-96", config, 1, characters), **turns) for characters in (1, 32)]
     record = _record(prepared, profile, "round_parts", **_circumstances())
     return write_table(records_folder(profile) / "round_parts.csv", pd.concat(tables), record)
+
+
+def fastest_implementations(table: pd.DataFrame) -> pd.DataFrame:
+    """Keep the fastest implementation of each framework, for tables that have one number a cell.
+
+    Rows are those in float32 on a CPU, and on a GPU in tf32, which JAX takes by itself. The FFT form
+    is left out: it is there to be compared with, not to be used.
+
+    Args:
+      table: `synthesis_ways`. What several suites have timed counts as it is in the first of them,
+        "main" before the others and "bars" last, so that neighbours in a table come from the same
+        turns where that can be.
+
+    Returns:
+      The rows, one for each model, window, steps, framework, device and number of characters.
+    """
+    wanted = table["device"].map({"GPU": "tf32"}).fillna("float32")
+    kept = table[(table["precision"] == wanted) & (table["way"] != "jit, FFT")]
+    keys = ["model", "window_frames", "steps", "framework", "device", "characters"]
+    turn = kept["suite"].map({"main": 0, "bars": 2}).fillna(1)
+    kept = kept.assign(turn=turn).reset_index(drop=True)
+    kept = kept[kept["turn"] == kept.groupby(keys)["turn"].transform("min")].drop(columns="turn")
+    fastest = kept.loc[kept.groupby(keys)["value"].idxmin()]
+    fastest = fastest.assign(model=pd.Categorical(fastest["model"], table["model"].unique()))
+    order = {"model": True, "window_frames": True, "steps": False, "characters": True}
+    fastest = fastest.sort_values(list(order), ascending=list(order.values()))
+    return fastest.astype({"model": table["model"].dtype}).reset_index(drop=True)

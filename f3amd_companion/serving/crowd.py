@@ -38,8 +38,7 @@ from f3amd_lib.ground.names import checked_seed
 from f3amd_lib.ground.trees import errors_name, weights_digest
 from f3amd_lib.motion.root_paths import NAMES, RootPath, named_path
 from f3amd_lib.motion.skeleton import Motion, Skeleton, describe_skeleton, described_skeleton
-from f3amd_lib.rollout.rollout import MotionGenerator
-from f3amd_lib.rollout.start_poses import path_start, pose_speed, starting_poses
+from f3amd_lib.rollout.rollout import MotionGenerator, path_start, pose_speed, starting_poses
 
 PATHS = tuple(name for name in NAMES if name != "complex")
 """Names that the paths of a crowd are drawn from: those that face where they go."""
@@ -233,27 +232,16 @@ def generate_crowd(
     if not styles:
         raise ValueError("a crowd needs at least one style")
     settings = {
-        "format": FORMAT,
-        "num_characters": num_characters,
-        "num_frames": num_frames,
-        "fps": FPS,
-        "seed": checked_seed(seed),
-        "chunk": chunk,
-        "paths": PATHS,
-        "min_distance": min_distance,
-        "styles": list(trained.styles),
-        "styles_in_turn": styles,
-        **describe_skeleton(skeleton),
-        "offsets": np.asarray(skeleton.offsets).tolist(),
-        "model": {
-            "name": trained.name,
-            "weights": weights_digest(trained.params),
-            "dtype": "float32",
-            "sampler": generator.sampler,
-            "sigmas": np.asarray(generator.sigmas, np.float64).tolist(),
-            **{name: trained.record.get(name) for name in ("dataset", "dataset_licence", "dataset_credit")},
-        },
-    }
+        "format": FORMAT, "num_characters": num_characters, "num_frames": num_frames, "fps": FPS,
+        "seed": checked_seed(seed), "chunk": chunk, "paths": PATHS, "min_distance": min_distance,
+        "styles": list(trained.styles), "styles_in_turn": styles,
+        **describe_skeleton(skeleton), "offsets": np.asarray(skeleton.offsets).tolist(),
+    }  # fmt: skip
+    settings["model"] = {
+        "name": trained.name, "weights": weights_digest(trained.params), "dtype": "float32",
+        "sampler": generator.sampler, "sigmas": np.asarray(generator.sigmas, np.float64).tolist(),
+        **{name: trained.record.get(name) for name in ("dataset", "dataset_licence", "dataset_credit")},
+    }  # fmt: skip
     settings = json.loads(json.dumps(settings))
     out = Path(out)
     with locked(out.resolve().with_name(f".{out.resolve().name}.lock"), f"animating the crowd {out.name}"):

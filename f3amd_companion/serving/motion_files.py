@@ -1,4 +1,4 @@
-"""Motion in the files of others: BVH, glTF 2.0 (`.glb`), and a table that any program reads.
+"""Motion in the files of others: BVH, glTF 2.0 (`.glb`), a table that any program reads; and a start from a file.
 
 glTF has skeleton, skin and animation in one file, which engines and Blender open. A character has joints, a skin and a
 mesh (`text.data.body`). Units are metres, +Y is up, and with yaw 0 it faces +Z: glTF's own conventions. Rotations are
@@ -14,10 +14,17 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from f3amd_lib.ground.files import named_file, write_whole
+from f3amd_lib.data.features import center_window, frame_yaw, motion_from_frames, turn_frames, world_frames
+from f3amd_lib.ground.files import named_file, read_toml, write_whole
+from f3amd_lib.ground.names import check_known
+from f3amd_lib.motion.anatomy import ROLES
 from f3amd_lib.motion.bvh import write_bvh
-from f3amd_lib.motion.skeleton import Motion
+from f3amd_lib.motion.retarget import retarget
+from f3amd_lib.motion.root_paths import RootPath
+from f3amd_lib.motion.skeleton import Motion, resample
+from f3amd_lib.rollout.rollout import path_start
 from f3amd_lib.text.data.body import make_body
+from f3amd_lib.training.checkpoints import TrainedModel
 
 _COMPONENTS = {"u1": 5121, "u2": 5123, "u4": 5125, "f4": 5126}
 _KINDS = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
@@ -147,3 +154,54 @@ def write_motion(path: Path, motion: Motion, *, credit: str = "", overwrite: boo
     if path.suffix == ".glb":
         return write_glb(path, motion, credit=credit, overwrite=overwrite)
     return {".bvh": write_bvh, ".csv": write_motion_csv}[path.suffix](path, motion, overwrite=overwrite)
+
+
+def read_joint_map(path) -> dict[str, str]:
+    """Return role -> joint's name, of a TOML file of lines such as left_knee = "calf_l"."""
+    try:
+        named = read_toml(path)
+    except (OSError, ValueError) as error:
+        raise ValueError(
+            f'{path}: cannot be read as TOML ({error}); write lines such as left_knee = "calf_l"'
+        ) from error
+    for role, name in named.items():
+        check_known(role, sorted(ROLES), f"role in {path}:")
+        if not isinstance(name, str):
+            raise ValueError(f"{path}: {role} must be a joint's name in quotes, got {name!r}")
+    return named
+
+
+def start_history(trained: TrainedModel, motion: Motion, path: RootPath) -> tuple[np.ndarray, str]:
+    """Make a motion's last frames the history of a rollout along a path.
+
+    A motion of the model's own skeleton is taken as it is; one of another humanoid is retargeted.
+
+    Args:
+      trained: the model.
+      motion: at any frame rate.
+      path: what is to be followed; the history is moved to its start and turned to face as it does.
+
+    Returns:
+      World frames, [1, H, C], for `MotionGenerator.rollout(history=...)`, and a sentence that says what was done.
+
+    Raises:
+      ValueError: for a motion shorter than the history, or a skeleton whose joints we cannot name.
+    """
+    motion, frames = resample(motion, 30.0, smooth=True), trained.config.num_history
+    if motion.num_frames < frames:
+        needed = f"{frames}, {frames / 30.0:.1f} s"
+        raise ValueError(f"{motion.name}: {motion.num_frames} frames at 30 fps; a start needs {needed}")
+    motion = motion.slice(motion.num_frames - frames, motion.num_frames)
+    if motion.skeleton == trained.skeleton:
+        note = f"{motion.name}: the model's own skeleton, taken as it is"
+    else:
+        pose = next(iter(trained.start_poses.values()))[0]
+        made, scale, error = retarget(motion, motion_from_frames(trained.skeleton, pose))
+        joints = f"{motion.skeleton.num_joints} joints, the model's has {trained.skeleton.num_joints}"
+        off = f"legs scaled by {scale:.2f}, joints off by {error.mean():.1f} cm on average"
+        note = f"{motion.name}: another skeleton ({joints}), retargeted by role; {off}"
+        motion = made
+    world = world_frames(motion)
+    turn = path.yaw[0] - frame_yaw(trained.skeleton, world)[-1]
+    turned = turn_frames(center_window(world, world[-1, [0, 2]]), turn)
+    return center_window(turned, -path_start(path.position))[None].astype(np.float32), note

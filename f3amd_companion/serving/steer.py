@@ -23,7 +23,7 @@ from f3amd_companion.serving.player import describe_for_web, read_web, whole_pag
 from f3amd_lib.drawing.stick_figures import LIMB_COLORS, TARGET_COLOR, bones_of
 from f3amd_lib.ground.files import named_file, read_toml, write_whole
 from f3amd_lib.ground.names import check_known
-from f3amd_lib.rollout.start_poses import pose_speed
+from f3amd_lib.rollout.rollout import pose_speed
 from f3amd_lib.training.checkpoints import TrainedModel
 
 _PAGE, _PINNED = (read_toml(Path(__file__).with_name(name)) for name in ("steer.toml", "npm_packages.toml"))

@@ -24,6 +24,7 @@ import f3amd_lib
 from f3amd_lib.ground import log
 from f3amd_lib.ground.files import named_file, read_toml, set_aside, write_whole
 from f3amd_lib.ground.names import asked_network
+from f3amd_lib.ground.profiles import repository_root
 
 _CHECKOUT = str(Path(__file__).resolve().parents[2])
 _CODE = ("f3amd_lib", "f3amd_companion", "notebooks")
@@ -292,3 +293,27 @@ def whole_table(path) -> tuple[pd.DataFrame, dict] | None:
         return (_rows(text), record) if _text_hash(text) == record["table"]["sha256"] else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
+
+
+def committed_table(dataset: str, name: str, *, profile="laptop", kind="records") -> tuple[pd.DataFrame, dict] | None:
+    """Read a table that `make measure` left under `paper_figures/`.
+
+    Args:
+      dataset: a name of `profiles.DATASETS`.
+      name: of the table, without ending.
+      profile: whose results.
+      kind: "records", or "tables" for those that `make figures` left.
+
+    Returns:
+      (table, record), or None if nothing is committed for this data set. `table.attrs["stale"]`
+      says why it does not belong with the quality table beside it, "" if it does.
+
+    Raises:
+      ValueError: if the table is not the one that its record describes.
+    """
+    path = repository_root() / "paper_figures" / dataset / profile / kind / f"{name}.csv"
+    if not path.exists():
+        return None
+    table, record = read_table(path)
+    table.attrs["stale"] = folder_reason(path, record)
+    return table, record

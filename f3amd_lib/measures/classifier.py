@@ -576,13 +576,10 @@ def save_classifier(path: Path, classifier: StyleClassifier) -> None:
         "offsets": jnp.asarray(skeleton.offsets, jnp.float32),
     }
     metadata = {
-        "kind": "style classifier",
-        "classifier": dataclasses.asdict(classifier.config),
-        "styles": list(classifier.styles),
-        **describe_skeleton(skeleton),
-        "held_out_accuracy": classifier.held_out_accuracy,
-        "record": classifier.record,
-    }
+        "kind": "style classifier", "classifier": dataclasses.asdict(classifier.config),
+        "styles": list(classifier.styles), **describe_skeleton(skeleton),
+        "held_out_accuracy": classifier.held_out_accuracy, "record": classifier.record,
+    }  # fmt: skip
     save_tree(path, tree, metadata)
 
 

@@ -9,7 +9,6 @@ with the number of steps. These functions tell the two apart.
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import pandas as pd
 
 from f3amd_lib.data.features import frame_positions
@@ -20,7 +19,7 @@ from f3amd_lib.measures.distributions import diversity, mean_and_interval
 from f3amd_lib.measures.metrics import joint_acceleration
 from f3amd_lib.rollout.rollout import MotionGenerator
 from f3amd_lib.training.checkpoints import TrainedModel
-from f3amd_lib.training.denoising_task import DenoisingTask, network_inputs
+from f3amd_lib.training.denoising_task import network_inputs
 
 CM = 100.0
 
@@ -92,37 +91,6 @@ def held_out_error(trained: TrainedModel, windows: WindowSet, *, seed: int = 0) 
     return float(x0_error_by_sigma(trained, windows, levels, seed=seed)["joint_error_cm"].mean())
 
 
-def gradient_norm_by_sigma(task: DenoisingTask, params, windows: WindowSet, sigmas, *, seed: int = 0) -> pd.DataFrame:
-    """Measure how strongly a single window pulls at the weights at each noise level (claim T5).
-
-    Args:
-      task: whose loss is asked, the sum that it is trained on.
-      params: weights at which the gradient is taken.
-      windows: held-out windows; 64 of them are taken, one gradient each.
-      sigmas: noise levels, [N].
-      seed: of the noise, the same at every level.
-
-    Returns:
-      Columns sigma, value (mean over windows of the gradient's Euclidean norm), low, high (95 %), repeats.
-
-    Source: paper section 6 ("small-noise samples contribute little to the gradient").
-    """
-    batch = spread_windows(windows, 64)
-    keys = jax.random.split(jax.random.key(seed), batch.future.shape[0])
-
-    @jax.jit
-    def norms(sigma):
-        def of_one(given):
-            window, key = given
-            drawn = jax.tree.map(lambda leaf: leaf[None], window), sigma[None]
-            return optax.global_norm(jax.grad(lambda weights: task.loss(weights, None, drawn, key)[0])(params))
-
-        return jax.lax.map(of_one, (batch, keys))
-
-    rows = [{"sigma": float(sigma), **mean_and_interval(np.asarray(norms(jnp.float32(sigma))))} for sigma in sigmas]
-    return pd.DataFrame(rows)
-
-
 def window_quality(generator: MotionGenerator, windows: WindowSet, *, seed: int = 0) -> dict:
     """Sample one window for each of many held-out conditions and compare with what was captured.
 
@@ -140,9 +108,8 @@ def window_quality(generator: MotionGenerator, windows: WindowSet, *, seed: int 
         "joint_error_cm": _apart(predicted, real),
         "joint_acceleration_cm": float(np.mean(joint_acceleration(predicted))),
         "real_joint_acceleration_cm": float(np.mean(joint_acceleration(real))),
-        "seam_cm": _apart(predicted[:, 0], before),
-        "real_seam_cm": _apart(real[:, 0], before),
-    }
+        "seam_cm": _apart(predicted[:, 0], before), "real_seam_cm": _apart(real[:, 0], before),
+    }  # fmt: skip
 
 
 def seed_spread(
@@ -237,23 +204,3 @@ def input_use(
         {"metric": metric, "unit": "cm", **root_mean_square(of_metric)}
         for metric, of_metric in zip(("use_of_x", "use_of_sigma"), squares.T, strict=True)
     )
-
-
-def window_row(trained: TrainedModel, windows: WindowSet, *, steps=(8, 1), seed: int = 0) -> pd.DataFrame:
-    """Measure what a model does with single held-out windows, and whether it uses its noise.
-
-    Args:
-      trained: the model.
-      windows: held-out.
-      steps: numbers of denoising steps.
-      seed: of the noise.
-
-    Returns:
-      A row per number of steps: steps, then the figures of `noise_use` and `window_quality`.
-    """
-    rows = []
-    for count in steps:
-        generator = MotionGenerator(trained, count)
-        figures = noise_use(generator, windows, seed=seed)
-        rows.append({"steps": count, **figures, **window_quality(generator, windows, seed=seed)})
-    return pd.DataFrame(rows)

@@ -470,16 +470,13 @@ def first_metrics(
     values = {
         "trajectory_error_m": trajectory_error(positions, path, window),
         "direction_error_deg": direction_error(yaw, path, window),
-        "smoothness": smoothness(positions),
-        "coherence": coherence(positions),
-        "foot_sliding": slide,
-        "contact_share": contact_share,
-        "ird_cm": ird(positions, window),
-        "ird_excess_cm": ird_excess(positions, window),
+        "smoothness": smoothness(positions), "coherence": coherence(positions),
+        "foot_sliding": slide, "contact_share": contact_share,
+        "ird_cm": ird(positions, window), "ird_excess_cm": ird_excess(positions, window),
         "inter_frame_step_cm": inter_frame_step(positions),
         "joint_acceleration_cm": joint_acceleration(positions, fps),
         "path_drift": path_drift(positions, path),
-    }
+    }  # fmt: skip
     return {key: float(value) for key, value in values.items()}
 
 

@@ -11,9 +11,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from f3amd_lib.ground.files import read_toml
 from f3amd_lib.ground.names import check_known, checked_value
-from f3amd_lib.motion.anatomy import ROLES, leg_length
+from f3amd_lib.motion.anatomy import leg_length
 from f3amd_lib.motion.curves import unit
 from f3amd_lib.motion.skeleton import Motion, Skeleton
 
@@ -80,21 +79,6 @@ def as_person(
             motion = motion.slice(1, motion.num_frames)
             notes.append(f"its first frame is left out: wrists jump {100 * steps[0]:.0f} cm after it, as from a T-pose")
     return motion, notes
-
-
-def read_joint_map(path) -> dict[str, str]:
-    """Return role -> joint's name, of a TOML file of lines such as left_knee = "calf_l"."""
-    try:
-        named = read_toml(path)
-    except (OSError, ValueError) as error:
-        raise ValueError(
-            f'{path}: cannot be read as TOML ({error}); write lines such as left_knee = "calf_l"'
-        ) from error
-    for role, name in named.items():
-        check_known(role, sorted(ROLES), f"role in {path}:")
-        if not isinstance(name, str):
-            raise ValueError(f"{path}: {role} must be a joint's name in quotes, got {name!r}")
-    return named
 
 
 def call_by_roles(motion: Motion, joint_map: Mapping[str, str]) -> Motion:

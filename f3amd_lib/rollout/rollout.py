@@ -5,13 +5,14 @@ noise, denoise in a few steps, keep the last frames as the next history. All rou
 jitted scan.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from f3amd_lib.data.features import bend_path, center_window, num_channels, orthonormalise, path_condition
+from f3amd_lib.data import features
+from f3amd_lib.data.features import center_window, num_channels
 from f3amd_lib.diffusion.samplers import SAMPLERS
 from f3amd_lib.ground.arrays import finite_array
 from f3amd_lib.ground.names import check_known, checked_seed
@@ -20,11 +21,48 @@ from f3amd_lib.networks.conditioning import Condition
 from f3amd_lib.rollout.blending import blend_rollout
 from f3amd_lib.rollout.generated import Rollout
 from f3amd_lib.rollout.rounds import sample_round
-from f3amd_lib.rollout.start_poses import path_start, starting_poses
 from f3amd_lib.training.checkpoints import TrainedModel
 
 MOST_STEPS = 1000
 """Most steps a round: as many levels as diffusion models are trained on; thousands would compile for minutes."""
+
+
+def path_start(position):
+    """Return where a path [..., F, 2] would have been one frame before its first, [..., 2]."""
+    return 2.0 * position[..., 0, :] - position[..., 1, :]
+
+
+def pose_speed(poses: np.ndarray) -> np.ndarray:
+    """Return how fast starting poses [K, H, C] move over the ground, [K], metres a frame."""
+    travelled = np.linalg.norm(poses[:, -1, [0, 2]] - poses[:, 0, [0, 2]], axis=-1)
+    return travelled / max(1, poses.shape[1] - 1)
+
+
+def starting_poses(trained: TrainedModel, style_index, start, yaw, speed, pick: Callable) -> np.ndarray:
+    """Pick a stored starting pose for each character, and move it to where its path begins.
+
+    Args:
+      trained: the model; it has to have poses of all the styles.
+      style_index: places in `trained.styles`, [B].
+      start: x, z of the last frame, [B, 2], metres.
+      yaw: facing there, [B], radians.
+      speed: of the path, [B], metres a frame.
+      pick: chooses among the poses about as fast as the paths: `pick(style, members, counts)` returns a number from 0
+        for each of the characters `members` of a style, who have `counts` poses to choose from.
+
+    Returns:
+      World frames, [B, H, C], float64.
+    """
+    poses = np.empty((len(style_index), trained.config.num_history, num_channels(trained.skeleton)))
+    for style in np.unique(style_index):
+        members = np.flatnonzero(np.asarray(style_index) == style)
+        choices = trained.start_poses[trained.styles[style]]
+        gap = np.abs(pose_speed(choices) - speed[members, None])
+        fitting = gap <= gap.min(axis=-1, keepdims=True) + 0.1 / 30.0
+        number = pick(style, members, fitting.sum(axis=1))
+        # The first place where more than `number` fitting poses have been passed.
+        poses[members] = choices[np.argmax(fitting.cumsum(axis=1) > number[:, None], axis=1)]
+    return center_window(features.turn_frames(poses, yaw), -start)
 
 
 class MotionGenerator:
@@ -83,15 +121,15 @@ class MotionGenerator:
             target, yaw, target_before, number = inputs
             origin = history[:, -1, jnp.array([0, 2])]
             # Start where the character is and bend back to the line.
-            position = bend_path(target - target_before[:, None, :], target_before - origin)
-            path = normaliser.normalise_path(path_condition(position, yaw))
+            position = features.bend_path(target - target_before[:, None, :], target_before - origin)
+            path = normaliser.normalise_path(features.path_condition(position, yaw))
             condition = Condition(normaliser.normalise(center_window(history, origin)), path, style)
             if key.ndim:
                 keys = jax.vmap(jax.random.fold_in, (0, None))(key, number)
                 x0_hat = self.sample_window_each(keys, condition)
             else:
                 x0_hat = self.sample_window(jax.random.fold_in(key, number), condition)
-            future = orthonormalise(normaliser.denormalise(x0_hat))
+            future = features.orthonormalise(normaliser.denormalise(x0_hat))
             future = center_window(future, -origin)
             history = jnp.concatenate([history, future], axis=1)[:, -history.shape[1] :]
             return history, future

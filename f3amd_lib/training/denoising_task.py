@@ -12,16 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from f3amd_lib.data import windows as window_sets
 from f3amd_lib.data.features import Normaliser, center_window, orthonormalise
-from f3amd_lib.data.windows import (
-    Batch,
-    WindowSet,
-    draw_windows,
-    gather_windows,
-    mean_poses,
-    restart_from,
-    spread_windows,
-)
+from f3amd_lib.data.windows import Batch, WindowSet
 from f3amd_lib.diffusion.samplers import add_noise
 from f3amd_lib.ground.arrays import exact_products
 from f3amd_lib.motion.skeleton import Skeleton
@@ -152,17 +145,17 @@ class DenoisingTask(Task):
         config, window = self.config, self.model_config.window
         key_batch, key_sigma, key_loss = jax.random.split(key, 3)
         key_draw, key_own, key_damping = jax.random.split(key_batch, 3)
-        drawn = draw_windows(self.windows, key_draw, config.batch_size, config.captured_path_share)
-        batch = gather_windows(self.windows, *drawn)
+        drawn = window_sets.draw_windows(self.windows, key_draw, config.batch_size, config.captured_path_share)
+        batch = window_sets.gather_windows(self.windows, *drawn)
         history = batch.history
         if config.own_history_share > 0:
-            before = gather_windows(self.windows, *drawn, earlier=window)
+            before = window_sets.gather_windows(self.windows, *drawn, earlier=window)
             room = self.windows.room[drawn[0]] >= window
             history = self._own_history(state, batch, before, room, key_own)
         if config.history_damping > 0:
             history = self._damped(history, batch.style, key_damping)
         if history is not batch.history:
-            batch = restart_from(batch, history)
+            batch = window_sets.restart_from(batch, history)
         return (batch, draw_sigma(key_sigma, config.batch_size, config)), key_loss
 
     def _own_history(self, state: TrainingState, batch: Batch, before: Batch, room, key):
@@ -210,7 +203,7 @@ class DenoisingTask(Task):
         if training:
             batch, sigma = drawn
         else:
-            batch = spread_windows(drawn, _HELD_OUT_WINDOWS)
+            batch = window_sets.spread_windows(drawn, _HELD_OUT_WINDOWS)
             key_sigma, key = jax.random.split(key)
             sigma = self.config.diffusion.draw(key_sigma, (batch.future.shape[0],))
         key_noise, key_history, key_dropout = jax.random.split(key, 3)
@@ -272,5 +265,5 @@ def denoising_task(
     """
     if not model_config.normalise:
         normaliser = Normaliser.identity(model_config.channels)
-    constants = Constants(normaliser, mean_poses(windows))
+    constants = Constants(normaliser, window_sets.mean_poses(windows))
     return DenoisingTask(model_config, config, skeleton, constants, windows, dataset_fingerprint)

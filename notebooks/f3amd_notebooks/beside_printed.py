@@ -5,8 +5,7 @@ from collections.abc import Callable, Sequence
 import pandas as pd
 from f3amd_lib.ground.papers import has_paper_file, load_paper_file, load_paper_table, paper_folders
 from f3amd_lib.ground.profiles import runs_dir
-from f3amd_lib.ground.records import read_table
-from f3amd_lib.ground.stored import committed_table
+from f3amd_lib.ground.records import committed_table, read_table
 from f3amd_lib.ground.tables import markdown_table
 from f3amd_lib.measures.registry import METRICS
 from f3amd_lib.papers.printed import SCHEMAS, printed_tables
@@ -150,7 +149,7 @@ def speedups_by_turns(times: pd.DataFrame, fastest: Callable) -> pd.DataFrame:
 
     Args:
       times: `synthesis_ways`; JAX's rows count.
-      fastest: keeps one implementation of each (`speed_tables.fastest_implementations`).
+      fastest: keeps one implementation of each (`times.fastest_implementations`).
 
     Returns:
       As `speedups`; what two suites have timed counts once.

@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 from f3amd_lib.ground.names import row_label
 from f3amd_lib.ground.papers import load_paper_table
-from f3amd_lib.ground.stored import committed_table
+from f3amd_lib.ground.records import committed_table
 from f3amd_lib.ground.tables import figure_text, markdown_table
 from f3amd_lib.measures.distributions import intervals_over_repeats
 from f3amd_lib.measures.registry import SHOWN

@@ -3,9 +3,9 @@
 from pathlib import Path
 
 import pandas as pd
+from f3amd_lib.ground.names import counted_cores
 from f3amd_lib.ground.profiles import repository_root
-from f3amd_lib.ground.records import read_table
-from f3amd_lib.ground.stored import committed_table, machine_of
+from f3amd_lib.ground.records import committed_table, read_table
 from f3amd_lib.ground.tables import markdown_table
 from IPython.display import Image
 
@@ -88,3 +88,8 @@ def running_times(*, root=None) -> pd.DataFrame:
         columns[f"{record['dataset']}, {record['profile']}, {where}"] = seconds
     names = [path.stem for path in sorted((root / "notebooks").glob("[0-9][0-9]_*.ipynb"))]
     return pd.DataFrame(columns, index=pd.Index(names, name="notebook")).reset_index()
+
+
+def machine_of(record: dict) -> str:
+    """Return on what a record was made, and when: "2 cores (cpu), 2026-11-28."."""
+    return f"{counted_cores(record)} ({record['device_platform']}), {record['date_utc'][:10]}."

@@ -13,7 +13,7 @@ from test_site import DOCS, load
 from f3amd_companion.serving.onnx_export import denoiser_program
 from f3amd_lib.diffusion.samplers import ddim_step
 from f3amd_lib.diffusion.schedules import variance_exploding
-from f3amd_lib.ground.stored import committed_table
+from f3amd_lib.ground.records import committed_table
 
 pytestmark = pytest.mark.needs("jax2onnx")
 live = load(DOCS / "live.py")

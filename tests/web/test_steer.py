@@ -11,8 +11,8 @@ from steering_oracle import FPS, Steering, first_pose
 from f3amd_companion.serving import steer
 from f3amd_companion.serving.onnx_export import denoiser_program
 from f3amd_companion.serving.steer import write_steer
+from f3amd_companion.terminal import find_model
 from f3amd_lib.diffusion.schedules import variance_exploding
-from f3amd_lib.ground.profiles import find_model
 from f3amd_lib.measures.walking import seam_kick, slide_speed
 from f3amd_lib.rollout.rollout import MotionGenerator
 from f3amd_lib.training.checkpoints import load_model

@@ -1,11 +1,9 @@
-"""Speed tables from records: ours beside the paper's, and our own bars."""
+"""What the library asks of its own speed, beside what was measured."""
 
 import operator
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
-
 from f3amd_lib.ground.files import read_toml
 
 _ASKED = read_toml(Path(__file__).with_name("speed_bars.toml"))
@@ -48,30 +46,3 @@ def speed_bars(times: pd.DataFrame, *, suite: str = "main") -> pd.DataFrame:
         row = {"what": bar["what"], "characters": bar["characters"], "asked": asked}
         rows.append(row | {"measured": measured, "way": way, "met": met})
     return pd.DataFrame(rows)
-
-
-def fastest_implementations(table: pd.DataFrame) -> pd.DataFrame:
-    """Keep the fastest implementation of each framework, for tables that have one number a cell.
-
-    Rows are those in float32 on a CPU, and on a GPU in tf32, which JAX takes by itself. The FFT form
-    is left out: it is there to be compared with, not to be used.
-
-    Args:
-      table: `synthesis_ways`. What several suites have timed counts as it is in the first of them,
-        "main" before the others and "bars" last, so that neighbours in a table come from the same
-        turns where that can be.
-
-    Returns:
-      The rows, one for each model, window, steps, framework, device and number of characters.
-    """
-    wanted = table["device"].map({"GPU": "tf32"}).fillna("float32")
-    kept = table[(table["precision"] == wanted) & (table["way"] != "jit, FFT")]
-    keys = ["model", "window_frames", "steps", "framework", "device", "characters"]
-    turn = kept["suite"].map({"main": 0, "bars": 2}).fillna(1)
-    kept = kept.assign(turn=turn).reset_index(drop=True)
-    kept = kept[kept["turn"] == kept.groupby(keys)["turn"].transform("min")].drop(columns="turn")
-    fastest = kept.loc[kept.groupby(keys)["value"].idxmin()]
-    models = {model: place for place, model in enumerate(dict.fromkeys(table["model"]))}
-    place = fastest["model"].map(models).to_numpy()
-    sorting = np.lexsort((fastest["characters"], -fastest["steps"], fastest["window_frames"], place))
-    return fastest.iloc[sorting].reset_index(drop=True)
