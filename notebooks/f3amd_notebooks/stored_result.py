@@ -54,13 +54,14 @@ def caption_strip() -> tuple[Image | str, str]:
 
     `scripts/caption_strip.py` leaves both; where they are missing, the first says so.
     """
+    missing = "Not here: `python scripts/caption_strip.py` draws twelve captions."
     if (found := committed_table("bandai", "captions")) is None:
-        return "Not measured yet: `python scripts/caption_strip.py` draws twelve captions.", ""
+        return missing, ""
     table, record = found
     means = table.groupby("system", sort=False)[list(_SEEN)].mean().round(1).rename(columns=_SEEN).reset_index()
     picture = repository_root() / "paper_figures/bandai/laptop/media/captions.png"
     about = f"*Means of twelve captions; {machine_of(record)} {record['dataset_credit']}*"
-    return Image(filename=picture), f"{markdown_table(means, digits=1)}\n\n{about}"
+    return Image(filename=picture) if picture.is_file() else missing, f"{markdown_table(means, digits=1)}\n\n{about}"
 
 
 def running_times(*, root=None) -> pd.DataFrame:
