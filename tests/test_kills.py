@@ -168,6 +168,7 @@ def read_only(folder: Path, at: int) -> None:
 def command(phase: str, folder: Path, fault: str | None, at: int, answer) -> None:
     """Run a command that goes wrong; send its exit status and what it told the user."""
     sys.stdout, sys.stderr = io.StringIO(), io.StringIO()
+    command_line.terminal.set_environment()  # a full disk leaves programs cut short, which are compiled anew
     tqdm.tqdm.status_printer = staticmethod(lambda file: lambda bar: None)
     os.environ |= {"F3AMD_RESULTS_DIR": str(folder / "results"), "F3AMD_CACHE_DIR": str(folder / "cache")}
     try:
