@@ -6,14 +6,14 @@ from f3amd_notebooks import beside_printed as beside
 from f3amd_notebooks import stored_result
 from f3amd_notebooks.beside_printed import beside_printed, judge_note
 
-from f3amd_lib.ground import stored
+from f3amd_lib.ground import records
 
 
 @pytest.fixture
 def committed(monkeypatch):
     """Tables that are committed, by name: (table, record); a test puts in what it wants."""
     tables = {}
-    for module in (stored, stored_result, beside):
+    for module in (records, stored_result, beside):
         monkeypatch.setattr(module, "committed_table", lambda dataset, name: tables.get(name))
     return tables
 

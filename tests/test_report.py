@@ -14,7 +14,7 @@ from f3amd_notebooks.stored_result import stored_result
 from PIL import Image
 
 from f3amd_lib.drawing import style as figures
-from f3amd_lib.ground import papers, records, stored, tables
+from f3amd_lib.ground import papers, records, tables
 from f3amd_lib.ground.names import counted_cores
 from f3amd_lib.networks.presets import find_preset
 
@@ -169,7 +169,7 @@ def test_markdown_has_units_dashes_and_alignment():
 
 
 def test_a_stored_result_is_shown_with_its_origin(tmp_path, monkeypatch):
-    monkeypatch.setattr(stored, "repository_root", lambda: tmp_path)
+    monkeypatch.setattr(records, "repository_root", lambda: tmp_path)
     assert "No stored `02_any` of `laptop` on `synthetic` yet" in stored_result("synthetic", "02_any")
     told, path = record(), tmp_path / "paper_figures/synthetic/laptop/tables/02_any.csv"
     records.write_table(path, pd.DataFrame({"model": ["a"], "value": [1.23456]}), told)

@@ -5,7 +5,7 @@ import pytest
 from builders import refused
 from f3amd_notebooks.stored_result import measured_table
 
-from f3amd_lib.ground import records, stored
+from f3amd_lib.ground import records
 from f3amd_lib.ground.profiles import load_profile, repository_root
 from f3amd_lib.ground.trees import weights_digest
 from f3amd_lib.training.checkpoints import load_model
@@ -13,20 +13,20 @@ from f3amd_lib.training.pipeline import PRETRAINED_DIR
 
 
 def test_committed_tables_are_found_checked_or_absent(tmp_path, monkeypatch):
-    monkeypatch.setattr(stored, "repository_root", lambda: tmp_path)
-    assert stored.committed_table("synthetic", "learning") is None
+    monkeypatch.setattr(records, "repository_root", lambda: tmp_path)
+    assert records.committed_table("synthetic", "learning") is None
     path = tmp_path / "paper_figures/synthetic/laptop/records/learning.csv"
     record = records.run_record(profile="laptop", dataset="synthetic", seed=3)
     records.write_table(path, pd.DataFrame({"model": ["m"], "loss": [0.5]}), record)
-    table, read = stored.committed_table("synthetic", "learning")
+    table, read = records.committed_table("synthetic", "learning")
     assert table["loss"].tolist() == [0.5] and read["seed"] == 3
-    assert stored.committed_table("bandai", "learning") is None
+    assert records.committed_table("bandai", "learning") is None
     path.write_text(path.read_text().replace("0.5", "0.4"))
-    refused("not the table", stored.committed_table, "synthetic", "learning")
+    refused("not the table", records.committed_table, "synthetic", "learning")
 
 
 def test_measured_tables_are_those_of_the_data_set_then_bandais_and_say_so(tmp_path, monkeypatch):
-    monkeypatch.setattr(stored, "repository_root", lambda: tmp_path)
+    monkeypatch.setattr(records, "repository_root", lambda: tmp_path)
     found, sentence = measured_table("synthetic", "quality", "quality")
     assert found is None
     assert "`make measure MEASURE=quality DATA=bandai`" in sentence
@@ -71,7 +71,7 @@ def test_a_record_of_other_weights_or_another_classifier_is_stale(name, record, 
 
 
 def test_a_stale_table_is_marked_for_notebooks(tmp_path, monkeypatch):
-    monkeypatch.setattr(stored, "repository_root", lambda: tmp_path)
+    monkeypatch.setattr(records, "repository_root", lambda: tmp_path)
     folder = tmp_path / "paper_figures/bandai/laptop/records"
     record, table = records.run_record(profile="laptop", dataset="bandai", seed=0), pd.DataFrame({"value": [1.0]})
     measured_with = lambda digest: record | {"weights_digests": {"A": [digest]}}
