@@ -277,7 +277,7 @@ def test_the_measurement_keeps_its_rows_and_goes_on(name, prepared, monkeypatch)
         kept, _ = read_table(path.with_name(f"{other}.csv"))
         assert set(kept["model"]) <= {model for model, _ in rows}
     # What is on record is not measured again; tests of the runner say when it is.
-    monkeypatch.setattr(measure, "measure_model", None)
+    monkeypatch.setattr(measure.protocols, "measure_model", None)
     measure.measure_quality(prepared, profile)
     pd.testing.assert_frame_equal(read_table(path)[0], table)
 
