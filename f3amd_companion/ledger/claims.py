@@ -47,6 +47,7 @@ PROFILE_ORDER = ("gpu", "laptop")
 """Within a data set, where a figure is looked for first. Smoke runs decide nothing."""
 
 MARKS = dict(zip(judging.VERDICTS, "✓±>✗≈○", strict=False)) | {judging.REMARK: "·"}
+"""Verdict -> its mark on pages."""
 
 _KINDS = {
     name: function

@@ -28,7 +28,7 @@ from f3amd_lib.papers.printed import PUBLISHED_CAMDM, SCHEMAS, printed_tables
 
 
 TIMES = ("synthesis_time", "training_time")
-"""Those of them that hang on the device."""
+"""Tables that hang on the device."""
 
 _VALUES = {"x0_by_sigma": "x0_error"}
 

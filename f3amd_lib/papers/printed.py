@@ -13,7 +13,6 @@ SCHEMAS: dict[str, list[str]] = read_toml(Path(__file__).with_name("schemas.toml
 """Tables that claims are judged by -> columns that name a row. Each also has `value` (in the last two
 a column of another name) and, where it was repeated, `low` and `high`."""
 
-
 PUBLISHED_CAMDM = "CAMDM published"
 """Row of the network with the weights that CAMDM's authors published: no preset of ours."""
 
