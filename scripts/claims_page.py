@@ -169,6 +169,8 @@ def main() -> int:
         for change in write_ledger(ledger_path(name), judge_claims(paper=name), accept=asked.accept):
             print(change)
             status = int(not asked.accept)
+    if status:
+        print("Their pages were not written. If these verdicts are right: --accept")
     return status
 
 

@@ -26,7 +26,6 @@ from f3amd_lib.papers.printed import PUBLISHED_CAMDM, SCHEMAS, printed_tables
 
 # --------------------------------------------------------------------------------- tables as claims want them
 
-
 TIMES = ("synthesis_time", "training_time")
 """Tables that hang on the device."""
 

@@ -1,4 +1,4 @@
-"""Motion as pictures: film strips, rows of poses, crowds for the page; GIFs for the eye.
+"""Motion as pictures: film strips, rows of poses, bodies of a crowd.
 
 All draw the stick figures of `stick_figures`, with a green dot under a toe that is in contact. Of a
 skeleton whose toes are not known no contacts are shown; one whose hips are not known is taken to
@@ -63,17 +63,18 @@ _CIRCLE = 0.27 * np.stack([np.sin(_TURN), np.cos(_TURN)], axis=-1)
 
 
 def on_ground(xz: np.ndarray) -> np.ndarray:
+    """Return points [..., 3] at height 0, of x and z [..., 2]."""
     return np.stack([xz[..., 0], np.zeros(xz.shape[:-1]), xz[..., 1]], axis=-1)
 
 
 def toes_down(motion: Motion, frames) -> list:
-    """Toes in contact at each frame that is asked for."""
+    """Return the toes in contact at each frame that is asked for."""
     toes = np.array(stick_figures.toes_of(motion.skeleton))
     return [toes[np.asarray(row, bool)] for row in motion.contacts[frames]] if len(toes) else [()] * len(frames)
 
 
 def beside_each_other(motions, paths, titles) -> list[tuple]:
-    """(motion, path or None, title) of each; one path or title stands for all."""
+    """Return (motion, path or None, title) of each; one path or title stands for all."""
     motions = [motions] if isinstance(motions, Motion) else list(motions)
     if not motions:
         raise ValueError("a picture needs at least one motion")
@@ -246,7 +247,7 @@ def draw_crowd(axis, motions, colors, frame: int, camera: Camera, scale: float) 
 
 
 def ground_lines(camera: Camera, step: float, radius: float, color: str) -> LineCollection:
-    """Lines on the ground a step apart, inside a circle around the camera's target and before the eye."""
+    """Return lines on the ground a step apart, inside a circle around the camera's target and before the eye."""
     lines = []
     for across, along in ((0, 2), (2, 0)):
         middle = camera.target[across]
@@ -257,6 +258,3 @@ def ground_lines(camera: Camera, step: float, radius: float, color: str) -> Line
             seen = camera.project(line)
             lines.append(seen[camera.distance - seen[:, 2] > 1.0, :2])
     return LineCollection(lines, colors=color, linewidths=0.7, zorder=0.5)
-
-
-# ---------------------------------------------------------------------------------- moving pictures
