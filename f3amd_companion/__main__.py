@@ -32,13 +32,14 @@ from etils import epy
 from tyro.conf import Positional, UseAppendAction
 
 from f3amd_lib import __version__
+from f3amd_lib.ground import log
 from f3amd_lib.ground.files import check_own_folder, locked, write_whole
 from f3amd_lib.ground.names import check_known, checked_seed, checked_value
 from f3amd_lib.ground.profiles import load_profile, results_dir, runs_dir
 
 with epy.lazy_imports():
-    import jax
     import numpy as np
+    import optax
     import pandas as pd
     import safetensors
 
@@ -66,8 +67,6 @@ with epy.lazy_imports():
     from f3amd_lib.text.sampling import captioned_motion
     from f3amd_lib.text.stages import text_models, train_stage
     from f3amd_lib.training import checkpoints, optimise, pipeline
-
-log = logging.getLogger("f3amd")
 
 UNFINISHED = 3
 """Exit status of `train`, `measure` and `campaign` where the minutes were over first; a later call goes on."""
@@ -836,7 +835,7 @@ def convert(
     text_models.save_text_model(target, trained, np.dtype("float32"))
     card = Path(__file__).with_name("released_card.template").read_text(encoding="utf-8")
     parts = [part for part in (trained.params, *trained.parts()[0].values()) if part is not None]
-    count, read_by = sum(leaf.size for leaf in jax.tree.leaves(parts)), trained.text_encoder or "reads no captions"
+    count, read_by = optax.tree.size(parts), trained.text_encoder or "reads no captions"
     told = {"trained": trained, "record": trained.record, "kind": trained.kind, "count": count, "encoder": read_by}
     _say_written(target, write_whole(target.with_suffix(".md"), card.format(**told)))
 

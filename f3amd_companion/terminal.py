@@ -12,9 +12,8 @@ import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
+from f3amd_lib.ground import log
 from f3amd_lib.ground.profiles import PRETRAINED_DIR, load_profile, runs_dir
-
-log = logging.getLogger("f3amd")
 
 
 def set_environment() -> None:

@@ -71,14 +71,14 @@ def seen(skeleton, fps: float, positions: np.ndarray) -> tuple[Motion, dict]:
 @plot_style()
 def draw(columns: dict[str, list[Motion]], credit: str):
     """Draw a row of poses for each caption and column."""
-    figure, axes = new_figure(13.0, 1.25 * len(CAPTIONS), len(CAPTIONS), len(columns))
+    figure, axes = new_figure(10.5, 1.25 * len(CAPTIONS), len(CAPTIONS), len(columns))
     for (title, motions), panels in zip(columns.items(), axes.T, strict=True):
         panels[0].set_title(title, fontsize=11, pad=18)
         for motion, panel in zip(motions, panels, strict=True):
             draw_poses(panel, motion, np.linspace(0, FRAMES - 1, POSES).astype(int), scale=34.0, numbered=False)
     for caption, panel in zip(CAPTIONS, axes[:, 0], strict=True):
         panel.text(0.0, 1.0, caption, transform=panel.transAxes, fontsize=9, fontweight="bold")
-    figure.supxlabel(credit, fontsize=7)
+    figure.supxlabel(f"Orange: left; blue: right. {credit}", fontsize=8)
     return figure
 
 
@@ -101,7 +101,7 @@ def main() -> None:
     folder = repository_root() / "paper_figures/bandai/laptop"
     write_table(folder / "records/captions.csv", pd.DataFrame(rows), record)
     source = data.credit.partition(";")[0]
-    light = show_figure(draw(columns, f"{source}; non-commercial use."), dpi=70, colors=8)  # a notebook holds it
+    light = show_figure(draw(columns, f"{source}; non-commercial use."), dpi=80, colors=8)  # a notebook holds it
     write_whole(folder / "media/captions.png", light.data)
 
 

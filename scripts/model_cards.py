@@ -13,7 +13,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import jax
+import optax
 import pandas as pd
 from page_tables import fill_tables
 
@@ -111,7 +111,7 @@ def _filled(name: str, path: Path, trained, params, measured: pd.DataFrame | Non
     non_commercial = "NC" in re.split(r"[\s-]+", record["dataset_licence"])
     return (_FOLDER / f"{name}.template").read_text(encoding="utf-8").format(
         trained=trained, record=record, file=path.name, megabytes=path.stat().st_size / 1e6,
-        count=sum(leaf.size for leaf in jax.tree.leaves(params)),
+        count=optax.tree.size(params),
         weights_type=describe(path).get("weights", "bfloat16"), date=record["date_utc"][:10],
         terms=": **non-commercial use only**" if non_commercial else "",
         commit=(record["git_commit"] or "unknown")[:10],

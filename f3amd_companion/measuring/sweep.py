@@ -28,6 +28,7 @@ import pandas as pd
 from f3amd_companion.measuring.campaign import Run, chosen, run_campaign
 from f3amd_companion.measuring.measure import MEASUREMENTS, models_with_weights, protocol_of
 from f3amd_companion.measuring.runner import kept_rows
+from f3amd_lib.ground import log
 from f3amd_lib.ground.files import locked, write_whole
 from f3amd_lib.ground.names import check_known, checked_value
 from f3amd_lib.ground.profiles import RESULTS_DIR_VARIABLE, Profile
@@ -35,8 +36,6 @@ from f3amd_lib.ground.records import read_table, record_hash, write_table
 from f3amd_lib.ground.trees import weights_digest
 from f3amd_lib.networks import presets
 from f3amd_lib.training.pipeline import PreparedData, model_files, obtain_model, prepare
-
-log = logging.getLogger("f3amd")
 
 CAMPAIGN, TRAIN = "campaign", "train"
 """Legs that are no measurement of `measure`: a snapshot of the queue, and the training of a preset."""

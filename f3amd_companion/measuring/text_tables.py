@@ -22,6 +22,7 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pandas as pd
 
 from f3amd_companion.measuring.runner import Records, record_of, records_folder
@@ -588,7 +589,7 @@ def _watched(profile: Profile, folder: Path, row: Mapping, model) -> tuple[dict,
         return {"parameters": 0}, pd.DataFrame()
     files = text_models.text_model_files(profile, model.name, folder=folder / f"seed{row['seed']}-{row['length']:g}")
     loss = read_table(files.history)[0]["held_out_loss"].dropna().iloc[-1]
-    size = sum(leaf.size for leaf in jax.tree.leaves(_judged(model)))
+    size = optax.tree.size(_judged(model))
     return {"parameters": size}, pd.DataFrame([{"metric": "held_out_loss", "value": loss}])
 
 

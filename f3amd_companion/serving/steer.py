@@ -13,8 +13,8 @@ import re
 import tarfile
 from pathlib import Path
 
-import jax
 import numpy as np
+import optax
 import pooch
 
 from f3amd_companion.serving.foot_locking import leg_chains
@@ -82,7 +82,7 @@ def steer_page(
     offered = sorted(map(int, card["sigmas"]), reverse=True)
     steps = "".join(choice.format(number, " checked" * (number == num_steps)) for number in offered)
     credits = card["credit"], f"Terms: {card['terms']}", *map(package_credit, ("onnxruntime-web", "three"))
-    count = sum(np.size(leaf) for leaf in jax.tree.leaves(trained.params))
+    count = optax.tree.size(trained.params)
     texts = {
         "title": html.escape(f"Steer {trained.name}"),
         "name": html.escape(trained.name),

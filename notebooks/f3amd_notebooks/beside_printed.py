@@ -68,7 +68,7 @@ def judge_note(name: str) -> str:
 
 WHOSE = {
     "paper": "the paper's, as printed",
-    "ours": "ours, at our scale: small networks, minutes of training",
+    "ours": "ours, at our scale: small networks, minutes to hours of training",
     "yours": "yours, measured by `f3amd reproduce`",
 }
 """What the figures of a table of a text notebook may be."""

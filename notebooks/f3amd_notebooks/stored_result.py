@@ -44,7 +44,7 @@ def measured_table(dataset: str, name: str, measurement: str) -> tuple[pd.DataFr
 
 
 _SEEN = {
-    "joint_acceleration": "joint acceleration, cm/frame²", "bones_off": "bones off, %",
+    "joint_acceleration": "joint acceleration, cm/frame² at 30 fps", "bones_off": "bones off, %",
     "moved": "moved by the fit, cm", "slide": "slide, cm/s", "slide_held": "with feet held, cm/s",
 }  # fmt: skip
 

@@ -19,6 +19,8 @@ from f3amd_lib.training.checkpoints import load_model
 
 pytestmark = pytest.mark.needs("jax2onnx", "onnxruntime")
 PHONE = (390, 844)
+SMALL = (400, 300)
+"""A window that software paints quickly, for tests of the network rather than of the picture."""
 
 
 @pytest.fixture(scope="module")
@@ -105,10 +107,10 @@ def webgpu_page(trained, program, tmp_path_factory):
 
 def test_rounds_by_webgpu_are_pythons(webgpu_browser, webgpu_page, trained):
     """The graphics card is played in software, slowly; its shaders are those that a card would run."""
+    webgpu_browser.resize(*SMALL)
     opened(webgpu_browser, webgpu_page.as_uri() + "#software-webgpu")
     assert webgpu_browser.find("#where").text == "by WebGPU in software"
-    for num_steps in (2, 1):
-        same_as_python(webgpu_browser, trained, num_steps, rounds=1)
+    same_as_python(webgpu_browser, trained, num_steps=2, rounds=1)
     assert webgpu_browser.script("return steer.state().runs") == "software"
     assert webgpu_browser.errors() == [] and webgpu_browser.requests() == []
 
@@ -128,6 +130,7 @@ def test_a_page_for_webgpu_says_why_it_walks_without_a_card(
 ):
     """WebAssembly takes over, of the runtime that would do both."""
     made = steer._worker
+    browser.resize(*SMALL)
     hidden = f"Object.defineProperty(self.navigator, 'gpu', {{value: {NO_CARD[reason]}}});\n"
     monkeypatch.setattr(steer, "_worker", lambda script: hidden + made(script))
     opened(browser, write_steer(tmp_path / "gpu.html", trained, program=program, runtime="webgpu"))
@@ -176,7 +179,7 @@ def test_a_slow_picture_gets_fewer_pixels_and_the_page_says_so(browser, page, sl
         f"let now = 0; const ask = requestAnimationFrame; requestAnimationFrame = (f) => ask(() => f(now += {step}));"
     )
     added = browser.command("Page.addScriptToEvaluateOnNewDocument", source=clock)
-    browser.resize(400, 300)
+    browser.resize(*SMALL)
     try:
         opened(browser, page)
         browser.wait(f"return {'steer.state().sharpness < 0.6' if slow else 'steer.state().pictures > 22'}", 120)
