@@ -36,11 +36,15 @@ def beside_printed(paper: str, name: str, metrics: Sequence[str]) -> tuple[pd.Da
     for whose, part in parts.items():
         for metric in metrics:
             rows = part[part["metric"] == metric].set_index(keys)
-            heading = METRICS[metric].title + ARROWS.get(METRICS[metric].better, "")
-            columns.append(rows.apply(_with_interval, axis=1).rename(f"{whose}: {heading}"))
+            columns.append(rows.apply(_with_interval, axis=1).rename(f"{whose}: {titled(metric)}"))
     if stored is not None:
         columns.append(stored.drop_duplicates(keys).set_index(keys)["trained"].rename("our network"))
     return pd.concat(columns, axis=1).fillna("–").reset_index(), sentence
+
+
+def titled(metric: str) -> str:
+    """Return a metric's title with the arrow that says which way is better."""
+    return METRICS[metric].title + ARROWS.get(METRICS[metric].better, "")
 
 
 def _with_interval(row) -> str:
