@@ -26,8 +26,10 @@ def test_the_papers_own_network_is_like_itself():
         (lambda t: t.assign(direction_error=8.5), "direction_error"),
         (lambda t: t.assign(trajectory_error=0.057), "trajectory_error"),
         (lambda t: t.assign(foot_all_frames=1.0), "foot_all_frames"),
-        (lambda t: t.assign(IRD=[1.8, 1.8, 1.7, 1.6]), "plateaus"),  # steps 1, 2, 4, 8
-        (lambda t: t.assign(**dict.fromkeys(t, 1.0)), "step"),  # steps change nothing
+        (lambda t: t.assign(IRD=[1.8, 1.8, 1.7, 1.6]), "plateau_8_4"),  # steps 1, 2, 4, 8
+        (lambda t: t.assign(IRD=[1.9, 1.8, 1.7, 1.7]), "plateau_2_1"),
+        (lambda t: t.assign(**dict.fromkeys(t, 1.0)), "step_4_2"),  # steps change nothing
+        (lambda t: t.assign(IRD=[1.8, 1.8, 3.0, 3.0]), "step_4_2"),  # or much
     ],
 )
 def test_a_network_that_is_not_fails_the_line_that_sees_it(change, fails):

@@ -34,7 +34,7 @@ import jax.numpy as jnp
 import pandas as pd
 
 import f3amd_lib
-from f3amd_companion.measuring.fingerprint import likeness_of_readings, real_rows, walk_rows, window_rows
+from f3amd_companion.measuring import fingerprint
 from f3amd_companion.measuring.paper_tables import beside_paper
 from f3amd_companion.measuring.runner import Records, records_folder
 from f3amd_companion.measuring.times import compiled_steps, training_call
@@ -281,6 +281,9 @@ def run_campaign(
     snapshots, measured = list(snapshots), classifier is not None
     if measured and table != "reproduced":
         protocol = replace(protocol, num_seeds=1)
+    if measured and table == "readings":  # what `walk_rows` walks
+        walks = {"num_frames": fingerprint.NUM_FRAMES, "windows_per_style": fingerprint.WINDOWS_PER_STYLE}
+        protocol = replace(protocol, styles=tuple(prepared.packed.styles), **walks)
     seed, about = (protocol.path_seed, {"protocol": asdict(protocol)}) if measured else (0, {})
     record = run_record(
         profile=profile, dataset=prepared.packed, seed=seed, measurement=table if measured else "package",
@@ -292,7 +295,7 @@ def run_campaign(
         records = Records(records_folder(profile), record, {table: ["run", "windows"]}, known=known)
         if table == "readings" and not records.has(table, {"run": "real", "windows": 0}):
             clips, _ = held_out_clips(prepared.packed, prepared.packed.styles, prepared.window)
-            real = real_rows(prepared.packed, clips, window=prepared.window)
+            real = fingerprint.real_rows(prepared.packed, clips, window=prepared.window)
             records.put(table, {"run": "real", "windows": 0}, real.assign(model="real", weights=""))
     elif jax.config.jax_compilation_cache_dir:
         compiled = lambda run: compiled_steps(_laid_out(prepared, run, batch_size)[1], 50, precision)
@@ -401,9 +404,9 @@ def _reading_rows(trained, data: PreparedData, classifier, protocol: Protocol, h
     use = noise_use(MotionGenerator(trained, STEPS_MEASURED[0]), held_out, seed=protocol.path_seed)
     names = ("x0_error_ratio", "seed_spread")
     figures = {"metric": names, "unit": ["", "cm"], "value": [use[METRICS[name].key] for name in names], "steps": 0}
-    tables = [walk_rows(trained, data.packed, classifier, seed=protocol.path_seed), pd.DataFrame(figures)]
+    tables = [fingerprint.walk_rows(trained, data.packed, classifier, seed=protocol.path_seed), pd.DataFrame(figures)]
     if trained.diffusion.kind == "variance_exploding":
-        tables.append(window_rows(trained, held_out, seed=protocol.path_seed))
+        tables.append(fingerprint.window_rows(trained, held_out, seed=protocol.path_seed))
     return pd.concat(tables, ignore_index=True)
 
 
@@ -468,10 +471,11 @@ def reproduce_own(
             if state == "unfinished":
                 return None
     place = records_folder(profile)
-    (made, record), (readings, of_readings) = (read_table(place / f"{one}.csv") for one in ("reproduced", "readings"))
+    (made, record), (walked, of_readings) = (read_table(place / f"{one}.csv") for one in ("reproduced", "readings"))
     made = made[made["run"].isin([run.name for run, _ in snapshots]) & (made["windows"] == total)]
     made = made.assign(window_frames=prepared.window)
     printed = printed_tables()["quality"]
     printed = printed[printed["model"].isin(made["model"]) & (printed["window_frames"] == prepared.window)]
     beside = write_table(place / "reproduced_beside_paper.csv", beside_paper(printed, made, SCHEMAS["quality"]), record)
-    return beside, write_table(place / "reproduced_likeness.csv", likeness_of_readings(readings), of_readings)
+    likeness = fingerprint.likeness_of_readings(walked)
+    return beside, write_table(place / "reproduced_likeness.csv", likeness, of_readings)

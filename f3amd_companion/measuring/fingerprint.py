@@ -200,8 +200,8 @@ REFUSED: dict[str, str] = load_paper_file("fingerprint")["refused"]
 def _figure(line: dict, by_steps: pd.DataFrame, real: pd.Series, steps: int) -> float:
     """Return what a line compares; metrics are columns of `by_steps`, numbers of steps its index."""
     if "change" in line:
-        pairs = [by_steps.loc[list(pair), line["change"]].to_numpy(float) for pair in line["between"]]
-        return float(np.max([np.abs(after / before - 1.0) for before, after in pairs]))
+        before, after = by_steps.loc[line["between"], line["change"]].to_numpy(float)
+        return float(np.max(np.abs(after / before - 1.0)))
     return float(by_steps.loc[steps, line["metric"]] / (real[line["metric"]] if line.get("of_real") else 1.0))
 
 
