@@ -100,9 +100,11 @@ def train_further(
     about |= {"started_from": weights_digest(before.params), "speeds": speeds}
     trained, history = train_and_keep(prepared, profile, preset, task, files, about)
     if ship and trained is not None:
+        # A slower copy of a window is no other window.
+        told = {**trained.record, "num_train_windows": before.record["num_train_windows"]}
         later = history[1:].assign(step=history["step"] + before.windows_seen // task.config.batch_size)
-        write_table(shipped.history, pd.concat([rows, later]), trained.record)
-        save_model(shipped.model, trained, jnp.int8)
+        write_table(shipped.history, pd.concat([rows, later]), told)
+        save_model(shipped.model, replace(trained, record=told), jnp.int8)
 
 
 if __name__ == "__main__":
