@@ -28,7 +28,10 @@ from f3amd_lib.training.recipe import TrainingConfig, paper_recipe, profile_reci
 PRINTED = dict(line.split()[::-1] for line in (Path(__file__).parent / "data" / "printed_numbers.sha256").open())
 LENGTH = {"num_steps", "batch_size"}
 # Shipped model -> what its training differs in from what its preset and the laptop profile give today.
-OTHERWISE = {"F3AMD-FNO-96-steady": set(), "F3AMD-FNO-64-steady": LENGTH | {"learning_rate", "seed", "warmup_steps"}}
+OTHERWISE = {
+    "F3AMD-FNO-96-steady": {"num_steps", "learning_rate", "warmup_steps"},  # of its last leg
+    "F3AMD-FNO-64-steady": LENGTH | {"learning_rate", "seed", "warmup_steps"},
+}
 PAPERS = PRETRAINED_DIR.parent / "papers"
 SHIPPED = sorted(PRETRAINED_DIR.glob("*/*.safetensors"))
 
