@@ -84,10 +84,10 @@ def _stop_at(minutes: float | None) -> float | None:
     return None if minutes is None else time.monotonic() + 60.0 * minutes
 
 
-def _use_fast_flags() -> None:
+def _use_fast_flags(num_devices: int | None = None) -> None:
     """Set XLA's flags, unless the user has; JAX reads them when it first looks for devices: call this before."""
     if "XLA_FLAGS" not in os.environ:
-        os.environ["XLA_FLAGS"] = machine.fast_xla_flags()
+        os.environ["XLA_FLAGS"] = machine.fast_xla_flags(num_devices)
 
 
 def _say_model(trained):
@@ -355,6 +355,7 @@ def train(
             raise ValueError("models of captioned motion train on one device: leave --all-devices out")
         files, train_one = _text_trainings(motion, captions, preset, steps, own, teacher, **leg)
     else:
+        _use_fast_flags(1)
         prepared, profile = motion.open(train_steps=steps, **own)
         leg["mesh"] = optimise.all_devices() if all_devices else None
         files = {name: pipeline.model_files(profile, name, folder=out) for name in preset or [profile.preset]}
@@ -705,8 +706,7 @@ def campaign(
       measure: measure a package's weights in the folder, and train nothing.
     """
     stop_at = _stop_at(minutes)
-    if times:
-        _use_fast_flags()
+    _use_fast_flags(None if times else 1)
     check_known(queue, long_queue.QUEUES, "queue")
     long_queue.check_precision(precision)
     place, table = (long_queue.QUEUES[queue], queue) if package is None else (long_queue.GPU_PLAN, "readings")

@@ -16,6 +16,7 @@ from f3amd_companion.measuring import campaign, measure
 from f3amd_companion.measuring import times as measurements
 from f3amd_companion.measuring.campaign import Run, chosen, longest_first, queue, run_campaign
 from f3amd_companion.measuring.times import Candidate
+from f3amd_companion.speed.implementations import Workload, round_flops
 from f3amd_lib.data.packed import save_packed
 from f3amd_lib.ground.profiles import load_profile
 from f3amd_lib.ground.records import read_table
@@ -290,10 +291,15 @@ def test_training_times_on_record_are_taken_again_where_asked_or_where_one_is_mi
 
     def timed(**how):
         minutes.done.clear()
-        measurements.measure_training_time(prepared, profile, **how)
+        minutes.table = measurements.measure_training_time(prepared, profile, **how)
         return minutes.done.copy()
 
     assert timed() == [] and timed(again=True) == ["training"]
+    row = read_table(minutes.table)[0].iloc[0]
+    round_of_batch = Workload(row.model, prepared.model_config(row.model), 1, row.batch_size)
+    assert 2.4 < row.flops / round_flops(round_of_batch) < 3.0  # forward, and back to weights and most values
+    assert row.gflops == pytest.approx(row.flops / row.value / 1e9)
+    assert row.share_of_peak == pytest.approx(row.gflops / row.peak_gflops)
     monkeypatch.setattr(measurements, "_TRAINED", ("F3AMD-FNO-32", "F3AMD-FNO-48"))
     assert timed() == ["training", "training"] and timed() == []
 

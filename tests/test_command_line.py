@@ -234,7 +234,7 @@ def test_steer_hands_the_model_its_steps_and_its_bits_to_the_page(weights, tmp_p
 def no_fast_flags(monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", "")  # so that what a command sets is taken back
     monkeypatch.delenv("XLA_FLAGS")
-    monkeypatch.setattr(machine, "fast_xla_flags", lambda: "--fast")
+    monkeypatch.setattr(machine, "fast_xla_flags", lambda num_devices: "--fast")
 
 
 def test_bench_hands_its_options_on_and_starts_jax_with_fast_flags(no_fast_flags, monkeypatch):
@@ -255,19 +255,26 @@ def test_bench_hands_its_options_on_and_starts_jax_with_fast_flags(no_fast_flags
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("words", [["bench", "--suite", "bar"], ["campaign", "--times", "--packed", "none.npz"]])
-def test_fast_flags_are_set_before_jax_looks_for_devices(words):
+@pytest.mark.parametrize(
+    ("words", "devices"),
+    [
+        (["bench", "--suite", "bar"], 3),
+        (["campaign", "--times", "--packed", "none.npz"], 3),
+        (["train", "--preset", "F3AMD-FNO-95"], 1),
+    ],
+)
+def test_fast_flags_are_set_before_jax_looks_for_devices(words, devices):
     script = f"""
 import os, sys
 from f3amd_companion.__main__ import main
 from f3amd_companion.speed import machine
-machine.fast_xla_flags = lambda: "--xla_force_host_platform_device_count=3"
+machine.fast_xla_flags = lambda devices: f"--xla_force_host_platform_device_count={{devices or 3}}"
 assert main({words!r}) == 2
 import jax
 sys.exit(jax.device_count())
 """
     environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
-    assert subprocess.run([sys.executable, "-c", script], env=environment, check=False).returncode == 3
+    assert subprocess.run([sys.executable, "-c", script], env=environment, check=False).returncode == devices
 
 
 def test_a_start_is_corrected_before_it_is_retargeted(weights, tmp_path, caplog, capsys):

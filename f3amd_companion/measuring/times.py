@@ -23,7 +23,7 @@ from f3amd_companion.measuring.runner import Records, record_of, records_folder
 from f3amd_companion.speed import implementations
 from f3amd_companion.speed.implementations import Workload, jit_round
 from f3amd_companion.speed.machine import describe_machine, device_name, matmul_precision, prepared_at_once
-from f3amd_companion.speed.timing import take_turns
+from f3amd_companion.speed.timing import Timing, take_turns
 from f3amd_lib.ground import log
 from f3amd_lib.ground.files import read_toml
 from f3amd_lib.ground.names import check_known, row_label
@@ -31,6 +31,7 @@ from f3amd_lib.ground.profiles import Profile
 from f3amd_lib.ground.records import read_table, write_table
 from f3amd_lib.networks import presets
 from f3amd_lib.networks.conditioning import ConditionEncoder, FiLM
+from f3amd_lib.networks.counting import count_flops
 from f3amd_lib.networks.spectral import FNOBlock
 from f3amd_lib.rollout.rounds import sample_round
 from f3amd_lib.training.denoising_task import DenoisingTask
@@ -145,13 +146,18 @@ def time_group(
     timings = take_turns(calls | {name: call for name, (call, _) in probes.items()}, progress=progress, **turns)
     rows = []
     for candidate, (workload, done) in ready.items():
-        timing, yardstick, flops = timings[candidate], yardsticks[candidate], implementations.round_flops(workload)
-        reached, peak = flops / timing.median / 1e9, probes[yardstick][1] / timings[yardstick].median / 1e9
+        timing, yardstick = timings[candidate], yardsticks[candidate]
         row = dataclasses.asdict(candidate) | {"sampler": workload.sampler, "framework": frameworks[candidate]}
         row |= {"device": device_name(), "compile_seconds": round(done.compile_seconds, 2)} | timing.columns("ms", 1e3)
-        row |= {"flops": flops, "gflops": reached, "peak_gflops": peak, "share_of_peak": reached / peak}
+        row |= _arithmetic(implementations.round_flops(workload), timing, probes[yardstick][1], timings[yardstick])
         rows.append(row)
     return pd.DataFrame(rows), failed
+
+
+def _arithmetic(flops: int, timing: Timing, probe_flops: int, probe: Timing) -> dict:
+    """Return what a row says of its arithmetic, beside that of a plain matrix product in the same turns."""
+    reached, peak = flops / timing.median / 1e9, probe_flops / probe.median / 1e9
+    return {"flops": flops, "gflops": reached, "peak_gflops": peak, "share_of_peak": reached / peak}
 
 
 def measure_synthesis_time(
@@ -228,8 +234,8 @@ def measure_training_time(
       stop_at: do not begin after this time (`time.monotonic`).
 
     Returns:
-      The table `records/training_time.csv`: value, low and high in seconds a step, epoch_minutes,
-      and peak_memory_mib as the compiler plans it. None where `stop_at` came first.
+      The table `records/training_time.csv`: value, low and high in seconds a step, its flops, gflops and share_of_peak
+      as of `time_group`, epoch_minutes, and peak_memory_mib as the compiler plans it. None where `stop_at` came first.
     """
     steps, chunk, batch_size = _TRAINING[profile.name]
     record = _record(prepared, profile, "training_time", steps=steps, chunk=chunk)
@@ -245,10 +251,14 @@ def measure_training_time(
     programs = prepared_at_once(lambda name: compiled_steps(tasks[name], chunk, "float32"), _TRAINED)
     compiled = {name: program() for name, program in tqdm(programs.items(), unit="compiled")}
     calls = {name: training_call(tasks[name], program) for name, (program, _) in compiled.items()}
+    calls["probe"], probe_flops = implementations.framework_probe("jax", "float32")
     timings = take_turns(calls, min_rounds=-(-steps // chunk), min_seconds=float("inf"), warmup=2, progress=True)
     windows, circumstances, rows = prepared.windows("train").num_windows, _circumstances(), []
+    probe = timings.pop("probe")
     for row, (name, timing) in zip(named, timings.items(), strict=True):
+        flops = count_flops(partial(advance, length=chunk), tasks[name], jax.eval_shape(initial_state, tasks[name]))
         row |= {"precision": "float32"} | timing.columns("s/step", 1.0 / chunk)
+        row |= _arithmetic(flops, timing, probe_flops, probe) | {"flops": flops // chunk}
         row |= {"steps_timed": timing.rounds * chunk, "compile_seconds": round(compiled[name][1], 1)}
         row |= {"epoch_windows": windows, "epoch_minutes": timing.median / chunk * windows / batch_size / 60.0}
         rows.append(row | {"peak_memory_mib": planned_memory(compiled[name][0]) / 2**20})
@@ -323,8 +333,7 @@ def time_breakdown(workload: Workload, **turns) -> pd.DataFrame:
             ready[part] = jit_round(workload, network)
     ready["noise"] = jit_round(workload, network, given_noise)
     timings = take_turns({part: done.call for part, done in ready.items()}, **turns)
-    named = {"model": workload.model, "steps": workload.steps, "characters": workload.characters}
-    named["device"] = device_name()
+    named = {key: getattr(workload, key) for key in ("model", "steps", "characters")} | {"device": device_name()}
     table = pd.DataFrame([named | {"without": part} | timing.columns("ms", 1e3) for part, timing in timings.items()])
     return table.assign(saved=(1.0 - table["value"] / table["value"][0]).mask(table["without"] == "nothing"))
 
@@ -361,12 +370,8 @@ def fastest_implementations(table: pd.DataFrame) -> pd.DataFrame:
     """
     wanted = table["device"].map({"GPU": "tf32"}).fillna("float32")
     kept = table[(table["precision"] == wanted) & (table["way"] != "jit, FFT")]
-    keys = ["model", "window_frames", "steps", "framework", "device", "characters"]
-    turn = kept["suite"].map({"main": 0, "bars": 2}).fillna(1)
-    kept = kept.assign(turn=turn).reset_index(drop=True)
-    kept = kept[kept["turn"] == kept.groupby(keys)["turn"].transform("min")].drop(columns="turn")
-    fastest = kept.loc[kept.groupby(keys)["value"].idxmin()]
-    fastest = fastest.assign(model=pd.Categorical(fastest["model"], table["model"].unique()))
-    order = {"model": True, "window_frames": True, "steps": False, "characters": True}
-    fastest = fastest.sort_values(list(order), ascending=list(order.values()))
+    kept = kept.assign(turn=kept["suite"].map({"main": 0, "bars": 2}).fillna(1)).sort_values(["turn", "value"])
+    keys = ["model", "window_frames", "steps", "characters", "framework", "device"]
+    fastest = kept.drop_duplicates(keys).astype({"model": pd.CategoricalDtype(table["model"].unique())})
+    fastest = fastest.sort_values(keys, ascending=[key != "steps" for key in keys]).drop(columns="turn")
     return fastest.astype({"model": table["model"].dtype}).reset_index(drop=True)
