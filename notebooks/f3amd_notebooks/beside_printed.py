@@ -133,11 +133,12 @@ def training_beside_paper(table: pd.DataFrame) -> pd.DataFrame:
 
     Returns:
       Columns model, window_frames, paper_minutes, paper_over_camdm, our_minutes, our_over_camdm,
-      seconds_per_step, batch_size, device.
+      seconds_per_step, share_of_peak (that of a plain matrix product, where it was measured), batch_size, device.
     """
     paper = load_paper_table(2)[["model", "window_frames", "value"]]
     paper = paper.rename(columns={"value": "paper_minutes"})
-    ours = table[["model", "window_frames", "epoch_minutes", "value", "batch_size", "device"]]
+    told = ["model", "window_frames", "epoch_minutes", "value", "share_of_peak", "batch_size", "device"]
+    ours = table.reindex(columns=told)
     ours = ours.rename(columns={"epoch_minutes": "our_minutes", "value": "seconds_per_step"})
     joined = paper.merge(ours, how="left", on=["model", "window_frames"])
     for name in ("paper", "our"):
