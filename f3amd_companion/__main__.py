@@ -864,7 +864,7 @@ def reproduce(
       profile: for f3amd gpu, laptop or smoke.
       minutes: stop after these with exit status 3; the same command continues.
       seed: of captions, crops and noise.
-      out: folder of the records instead of runs/.
+      out: folder of the records instead of runs/; for f3amd of states and weights.
     """
     terminal.check_there(data, evaluator, weights, text_weights)
     if paper == "f3amd":
