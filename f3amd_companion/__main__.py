@@ -706,8 +706,8 @@ def campaign(
       measure: measure a package's weights in the folder, and train nothing.
     """
     stop_at = _stop_at(minutes)
-    _use_fast_flags(None if times else 1)
     check_known(queue, long_queue.QUEUES, "queue")
+    _use_fast_flags(None if times else 1)
     long_queue.check_precision(precision)
     place, table = (long_queue.QUEUES[queue], queue) if package is None else (long_queue.GPU_PLAN, "readings")
     snapshots = long_queue.queue(place, package)

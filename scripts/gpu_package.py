@@ -41,15 +41,15 @@ python3 -m f3amd_companion campaign --data bandai --profile laptop --packed {pac
 
 
 def packed_bandai() -> Path:
-    """Return the packed walks of Bandai in the user's cache: the smallest file, as captioned motion takes all clips.
+    """Return the packed clips of Bandai in the user's cache, the newest file of them.
 
     Raises:
       ValueError: if there is none.
     """
-    found = sorted(cache_folder().glob("bandai-*.safetensors"), key=lambda path: path.stat().st_size)
+    found = sorted(cache_folder().glob("bandai-*.safetensors"), key=lambda path: path.stat().st_mtime)
     if not found:
         raise ValueError(f"{cache_folder()}: no packed clips of Bandai there; `f3amd data --data bandai` packs them")
-    return found[0]
+    return found[-1]
 
 
 def lay_out(folder: Path, package: str, minutes: float, packed: Path) -> int:
