@@ -258,8 +258,11 @@ def test_a_student_is_trained_by_name_with_all_before_it(data, tmp_path, monkeyp
     alone = from_file("tiny-M2", teacher=files["tiny-teacher"])
     assert same_tree(alone.params, made.params)
     assert sorted(path.name.split(".")[0] for path in elsewhere.glob("*.safetensors")) == ["tiny-M2"] * 2
+    beneath = from_file("tiny-teacher", teacher=files["tiny-teacher"])  # on the autoencoder that its file holds
+    assert same_tree([beneath.autoencoder_params, beneath.params], [teacher.autoencoder_params, teacher.params])
     for name, file, reason in (
         ("tiny-VAE", "tiny-teacher", "tiny-VAE needs no earlier model"),
+        ("tiny-VAE", "tiny-VAE", "tiny-VAE needs no earlier model"),
         ("tiny-M2", "tiny-VAE", "holds tiny-VAE, and tiny-M2 needs tiny-teacher"),
     ):
         refused(reason, from_file, name, teacher=files[file])

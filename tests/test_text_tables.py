@@ -177,11 +177,12 @@ def test_variety_is_that_of_one_captions_motions(data):
 
 
 def test_a_queue_trains_every_row_before_another_seed_and_only_compared_rows_with_several():
-    row, real, settings = {"trained": "tiny"}, {"trained": "Real"}, {"lengths": [0.5, 1.0, 2.0], "seeds": 3}
-    once = [(row, 0, 1.0), (real, 0, 1.0)]
-    first = [(row, 0, 0.5), (row, 0, 1.0), (row, 0, 2.0), (real, 0, 0.0)]
-    assert planned(once, settings, False) == first
-    assert planned(once, settings, True) == first + [(row, seed, length) for seed in (1, 2) for length in (0.5, 1.0)]
+    row, real, settings = {"trained": "tiny"}, {"trained": "Real"}, {"lengths": [0.25, 0.5, 1.0, 2.0], "seeds": 3}
+    once = [(row, 4, 1.0), (real, 4, 1.0)]
+    each = lambda *seeds: [(row, seed, length) for seed in seeds for length in (0.5, 1.0)]
+    last = [(row, 4, 0.25), (row, 4, 2.0)]
+    assert planned(once, settings, False) == [(real, 4, 0.0), *each(4), *last]
+    assert planned(once, settings, True) == [(real, 4, 0.0), *each(4, 5, 6), *last]
 
 
 def test_a_queue_trains_each_length_for_its_share_of_motions_on_what_it_stands_on(data, tmp_path, monkeypatch):

@@ -561,10 +561,14 @@ def measure_text_table(
             share = load_paper_file("recipes", stage.settings.paper)[f"short-{stage.recipe}"].get("share", 1.0)
             steps = max(1, round(motions / where["batch_size"] / share))
             if below := stands_on(preset):
-                if trained(below) is None:
-                    return None
-                once = apart / f"seed{profile.seed}-1"
-                where["teacher"] = text_models.text_model_files(profile, below, folder=once).model
+                # What ships holds it, perhaps beneath a model of this very name, and is the same on all machines.
+                ships = (text_models.shipped_file(one, data, encoder) for one in (below, preset))
+                where["teacher"] = next(filter(None, ships), None)
+                if where["teacher"] is None:
+                    if trained(below) is None:
+                        return None
+                    once = apart / f"seed{profile.seed}-1"
+                    where["teacher"] = text_models.text_model_files(profile, below, folder=once).model
             brief = dataclasses.replace(profile, train_steps=steps, seed=seed)
             return train_stage(data if latent else cut, encoder, brief, preset, **where)
         if form.latent and "autoencoder_steps" in settings:
@@ -641,15 +645,17 @@ def measure_rows(
 
 
 def planned(once: Iterable[tuple[Mapping, int, float]], settings: Mapping, compared: bool) -> list[tuple]:
-    """Return (row, seed, length) of all trainings of a table, in order: every row before any has another seed.
+    """Return (row, seed, length) of all trainings of a table, in order: first what a verdict on orders asks for.
 
-    The first seed goes through all lengths, those of rows that are `compared` to what a verdict asks for. Real motion
+    Rows that are `compared` have all seeds at half and at full length; other lengths have the first seed. Real motion
     has no length.
     """
-    lengths = lambda row: [0.0] if row["trained"] == REAL else settings["lengths"]
-    others = itertools.product(range(1, settings["seeds"] if compared else 1), once, (0.5, 1.0))
-    return [(row, seed, length) for row, seed, _ in once for length in lengths(row)] + [
-        (row, seed + number, length) for number, (row, seed, _), length in others if row["trained"] != REAL
+    seeds, lengths = range(settings["seeds"] if compared else 1), settings["lengths"]
+    asked, rest = ([one for one in lengths if (one in (0.5, 1.0)) is first] for first in (True, False))
+    every = itertools.chain(itertools.product(seeds, once, (asked,)), itertools.product((0,), once, (rest,)))
+    made = [(row, seed + number, length) for number, (row, seed, _), lengths in every for length in lengths]
+    return [(row, seed, 0.0) for row, seed, _ in once if row["trained"] == REAL] + [
+        one for one in made if one[0]["trained"] != REAL
     ]
 
 

@@ -121,7 +121,7 @@ def train_stage(
         frames, so that all begin where a caption's motion will: at the origin.
       batch_size, learning_rate: instead of the recipe's.
       folder: where files go instead of `runs/`.
-      teacher: file of what it stands on, such as a student's teacher that ships, instead of training one.
+      teacher: file that holds what it stands on, such as a student's teacher that ships, instead of training one.
       **leg: stop_at and progress, as for `optimise`.
 
     Returns:
@@ -141,7 +141,8 @@ def train_stage(
     before = None
     if teacher is not None:
         before = load_text_model(teacher)
-        if before.name != earlier:
+        holds = before.name, presets.find_preset(preset_and_branch(before.name)[0]).latent
+        if not earlier or earlier not in holds:
             raise ValueError(f"{teacher}: holds {before.name}, and {name} needs {earlier or 'no earlier model'}")
         if not before.record["identity"]["dataset_fingerprint"].startswith(data.fingerprint):
             raise ValueError(f"{teacher}: was trained on other clips than these; leave --teacher out to train one")
