@@ -46,7 +46,7 @@ from f3amd_lib.text.sampling import motionpcm_sampling, text_to_motion
 from f3amd_lib.text.sampling.captioned_motion import draw_motions, motion_drawer
 from f3amd_lib.text.stages import text_models
 from f3amd_lib.text.stages.text_models import CONTROL, PELVIS, LatentModel, TextModel
-from f3amd_lib.text.stages.train_stage import STAGES, stage_of, stands_on, train_stage
+from f3amd_lib.text.stages.train_stage import STAGES, stage_of, stage_recipe, stands_on, train_stage
 
 EXPERIMENTS = load_paper_file("experiments", "acmdm") | load_paper_file("experiments", "motionpcm")
 """Table -> its rows and what is trained for them; and the settings of each profile and plan."""
@@ -560,6 +560,12 @@ def measure_text_table(
             motions, stage = where.pop("motions") * length, STAGES[stage_of(preset)]
             share = load_paper_file("recipes", stage.settings.paper)[f"short-{stage.recipe}"].get("share", 1.0)
             steps = max(1, round(motions / where["batch_size"] / share))
+            brief = dataclasses.replace(profile, train_steps=steps, seed=seed)
+            own = {setting: where[setting] for setting in ("batch_size", "learning_rate")}
+            config = dataclasses.asdict(stage_recipe(stage.settings, stage.recipe, brief, base, **own))
+            if ships := text_models.shipped_for(preset, data, encoder, LatentModel) if latent else None:
+                if ships.record["identity"]["training"] == config:
+                    return ships
             if below := stands_on(preset):
                 # What ships holds it, perhaps beneath a model of this very name, and is the same on all machines.
                 ships = (text_models.shipped_file(one, data, encoder) for one in (below, preset))
@@ -569,7 +575,6 @@ def measure_text_table(
                         return None
                     once = apart / f"seed{profile.seed}-1"
                     where["teacher"] = text_models.text_model_files(profile, below, folder=once).model
-            brief = dataclasses.replace(profile, train_steps=steps, seed=seed)
             return train_stage(data if latent else cut, encoder, brief, preset, **where)
         if form.latent and "autoencoder_steps" in settings:
             steps = dataclasses.replace(profile, train_steps=settings["autoencoder_steps"])
@@ -591,8 +596,11 @@ def _watched(profile: Profile, folder: Path, row: Mapping, model) -> tuple[dict,
     """Return what a row of the plan says besides, its model's size, and the last held-out loss."""
     if model is None:
         return {"parameters": 0}, pd.DataFrame()
-    files = text_models.text_model_files(profile, model.name, folder=folder / f"seed{row['seed']}-{row['length']:g}")
-    loss = read_table(files.history)[0]["held_out_loss"].dropna().iloc[-1]
+    folder = folder / f"seed{row['seed']}-{row['length']:g}"
+    history = text_models.text_model_files(profile, model.name, folder=folder).history
+    if not history.exists():
+        history = text_models.PRETRAINED_DIR / profile.dataset / "text" / history.name  # that of what ships
+    loss = read_table(history)[0]["held_out_loss"].dropna().iloc[-1]
     size = optax.tree.size(_judged(model))
     return {"parameters": size}, pd.DataFrame([{"metric": "held_out_loss", "value": loss}])
 
