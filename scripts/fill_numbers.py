@@ -19,6 +19,7 @@ from page_tables import fill_tables
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this tree's library, whatever is installed
 
 from f3amd_notebooks.quality_tables import committed_quality
+from f3amd_notebooks.stored_result import table_of_seeds
 
 from f3amd_companion.ledger.claims import load_claims
 from f3amd_lib.ground.papers import load_paper_file
@@ -96,7 +97,7 @@ def _quality() -> dict[str, str]:
 
 def _text() -> dict[str, str]:
     keys = (["model", "steps", "metric"], ["model", "metric"], ["model", "steps", "metric"])
-    one, two, four = (pd.read_csv(RECORDS / f"text_pcm{n}.csv").set_index(key)["value"]
+    one, two, four = (table_of_seeds("bandai", f"text_pcm{n}")[0].set_index(key)["value"]
                       for n, key in zip((1, 2, 4), keys, strict=True))  # fmt: skip
     told = {"caption_ms": f"{1000 * one['MotionPCM-M1', 1, 'sampling_seconds']:.0f}"}
     rows = (("MotionPCM-teacher", 50), ("MotionPCM-teacher", 1), ("MotionPCM-M1", 1))

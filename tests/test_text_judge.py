@@ -16,6 +16,7 @@ from f3amd_lib.text.data.text_motions import text_motions
 from f3amd_lib.text.judge import text_judge, text_metrics
 from f3amd_lib.text.judge.text_judge import EvaluatorTraining
 from f3amd_lib.text.stages import text_models
+from f3amd_lib.training.pipeline import ModelFiles, alone_with
 
 STYLES = synthetic.STYLES[:4]
 SIZES = {"movement_width": 16, "motion_hidden": 16, "text_hidden": 16, "embedding_width": 8}
@@ -83,6 +84,14 @@ def test_a_judge_comes_back_from_its_file(judge, data, tmp_path):
     assert again.record["dataset_fingerprint"] == data.fingerprint
     (tmp_path / "cut").write_bytes((tmp_path / "judge.safetensors").read_bytes()[:-50])
     refused("cut", text_judge.load_judge, tmp_path / "cut")
+
+
+def test_two_processes_do_not_train_one_judge(data, tmp_path, cache_dir):
+    files = ModelFiles.of(tmp_path, "judge")
+    again = {"training": EvaluatorTraining(1), "files": files, "progress": False, **SIZES}
+    with alone_with(files):
+        refused("training judge", text_judge.train_judge, data, OneVectorAWord(), **again)
+    assert text_judge.train_judge(data, OneVectorAWord(), **again) and files.model.exists()
 
 
 def test_a_table_has_real_motion_first_and_every_figure_with_its_interval(judge, data, cache_dir):

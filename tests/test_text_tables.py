@@ -19,10 +19,12 @@ from f3amd_lib.motion import synthetic
 from f3amd_lib.networks import presets
 from f3amd_lib.papers.printed import SCHEMAS
 from f3amd_lib.text.judge.text_judge import load_judge
+from f3amd_lib.text.stages.text_models import load_text_model
 from f3amd_lib.training.pipeline import PRETRAINED_DIR
 
 QUIET = {"progress": False}
 FORMS = TINY | {"tiny-AE": dataclasses.replace(TINY["tiny-AE"], training={"window": 32})}  # clips have 40 frames
+QUEUE, TEACHER = load_paper_file("experiments", "acmdm")["settings"]["queue"], "MotionPCM-teacher-small"
 SHIPPED_JUDGE = PRETRAINED_DIR / "bandai" / "text" / "judge.safetensors"
 PLAIN, PREFIX = {"model": "ACMDM-S-PS22", "trained": "tiny"}, {"model": "ACMDM-S-PS2-prefix", "trained": "tiny-prefix"}
 SECTIONS = ("trained on pelvis", "trained on all joints", "noise optimisation", "upper-body edit", "without control")
@@ -177,21 +179,20 @@ def test_variety_is_that_of_one_captions_motions(data):
 
 
 def test_a_queue_trains_every_row_before_another_seed_and_only_compared_rows_with_several():
-    row, real, settings = {"trained": "tiny"}, {"trained": "Real"}, {"lengths": [0.25, 0.5, 1.0, 2.0], "seeds": 3}
-    once = [(row, 4, 1.0), (real, 4, 1.0)]
-    each = lambda *seeds: [(row, seed, length) for seed in seeds for length in (0.5, 1.0)]
-    last = [(row, 4, 0.25), (row, 4, 2.0)]
-    assert planned(once, settings, False) == [(real, 4, 0.0), *each(4), *last]
-    assert planned(once, settings, True) == [(real, 4, 0.0), *each(4, 5, 6), *last]
+    rows, settings = [{"trained": "tiny"}, {"trained": "Real"}], {"lengths": [0.25, 0.5, 1.0, 2.0], "seeds": 3}
+    each = lambda *seeds: [("tiny", seed, length) for seed in seeds for length in (0.5, 1.0)]
+    for compared, seeds in ((False, (4,)), (True, (4, 5, 6))):
+        told = [tuple(row.values()) for row in planned(rows, 4, settings, compared)]
+        assert told == [("Real", 4, 0.0), *each(*seeds), ("tiny", 4, 0.25), ("tiny", 4, 2.0)]
 
 
 def test_a_queue_trains_each_length_for_its_share_of_motions_on_what_it_stands_on(data, tmp_path, monkeypatch):
-    stages = load_paper_file("experiments", "acmdm")["settings"]["queue"]["stages"]
+    stages = QUEUE["stages"]
     settings = {"most_frames": 80, "lengths": [0.5], "seeds": 1, "compared": [], "stages": stages}
     bench, asked = types.SimpleNamespace(settings=settings, record=lambda *arguments: {"settings": settings}), []
 
     def train(data, encoder, profile, name, *, folder, teacher=None, **how):
-        asked.append((name, profile.train_steps, folder.name, teacher and teacher.parent.name, how["learning_rate"]))
+        asked.append((name, profile.train_steps, folder.name, teacher, how["learning_rate"]))
         return None if name == "ACMDM-S-PS22-n2" else name
 
     monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path))
@@ -202,5 +203,29 @@ def test_a_queue_trains_each_length_for_its_share_of_motions_on_what_it_stands_o
     steps = [stages[stage]["motions"] / stages[stage]["batch_size"] for stage in ("motion autoencoder", "ACMDM")]
     assert asked == [
         ("ACMDM-causal-AE-w64", steps[0], f"seed{seed}-1", None, 1e-3),
-        ("ACMDM-S-PS22-n2", round(0.5 * steps[1]), f"seed{seed}-0.5", f"seed{seed}-1", 1e-3),
+        ("ACMDM-S-PS22-n2", round(0.5 * steps[1]), f"seed{seed}-0.5", "ACMDM-causal-AE-w64", 1e-3),
     ]
+
+
+def test_a_queue_stands_on_what_ships_and_takes_it_for_its_own_recipe_alone(data, tmp_path, monkeypatch):
+    shipped = {name: load_text_model(SHIPPED_JUDGE.with_stem(name)) for name in (TEACHER, "MotionPCM-M1-small")}
+    bench, asked = types.SimpleNamespace(settings=QUEUE, record=lambda *arguments: {"settings": {}}), []
+
+    def train(data, encoder, profile, name, *, teacher=None, **how):
+        asked.append((name, profile.seed, profile.train_steps, teacher.name))
+
+    monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path))
+    monkeypatch.setattr(text_tables, "bench_of", lambda *arguments, **how: bench)
+    monkeypatch.setattr(text_tables, "train_stage", train)
+    monkeypatch.setattr(text_tables.text_models, "shipped_for", lambda name, *_: shipped.get(name))
+    found, seen = [], lambda *arguments: found.append(arguments[5])
+    monkeypatch.setattr(text_tables, "measure_rows", seen)
+    profile = dataclasses.replace(PROFILE, name="laptop", seed=0)
+    measure_text_table("text_pcm4", data, ENCODER, profile, plan="queue", **QUIET)
+    trained = found[0]
+    for name, model in shipped.items():
+        assert trained(name, 0, 1.0) is model and not asked
+        assert trained(name, 1, 1.0) is trained(name, 0, 0.5) is None
+        assert [(*one[:2], one[3]) for one in asked] == [(name, 1, TEACHER), (name, 0, TEACHER)]
+        assert asked[0][2] == pytest.approx(2 * asked[1][2], abs=2)
+        asked.clear()

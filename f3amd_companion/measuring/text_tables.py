@@ -13,7 +13,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -62,12 +62,6 @@ BRANCHES = {"trained on pelvis": PELVIS, "trained on all joints": CONTROL, "uppe
 
 UNCONTROLLED = "without control"
 """A section of ours: how far the network without a branch is from places that it was not told."""
-
-_VARIETY_DRAWS = 2
-"""Of as many motions as there are clips; of each caption of the group there are several in each."""
-
-_EULER_STEPS = 10
-"""Of the sampler whose noise is optimised (ACMDM Appendix F)."""
 
 
 @dataclass(frozen=True)
@@ -149,12 +143,13 @@ class Bench:
         """
         count = min(self.settings.get("varied", self.settings["group"]), self.real.num_clips // 2)
         clips, made, at_once = np.arange(self.real.num_clips) % count, [], self.real.num_clips // count
-        samples = self.settings.get("samples", _VARIETY_DRAWS * at_once)
+        samples = self.settings.get("samples", 2 * at_once)
         pooled, lengths = self.captions(0)[1][clips], self.real.lengths[clips]
         for number in range(-(-samples // at_once)):
             key = jax.random.fold_in(jax.random.key(self.seed), self.settings["repeats"] + number)
-            motions = [one[:length] for one, length in zip(make(pooled, lengths, key), lengths, strict=True)]
-            embedded = self.embed(motions)
+            embedded = self.embed(
+                [one[:length] for one, length in zip(make(pooled, lengths, key), lengths, strict=True)]
+            )
             made.append(embedded[: at_once * count].reshape(at_once, count, embedded.shape[-1]))
         made = np.swapaxes(np.concatenate(made)[:samples], 0, 1)
         far = text_metrics.multimodality(made, np.random.default_rng([self.seed, 4]))
@@ -287,7 +282,7 @@ def _controlled_states(bench: Bench, trained: TextModel, section: str, condition
         return lambda noise, control: text_to_motion.sample_control(*given, control, noise, **how)
 
     def optimised(noise, control):
-        few = how | {"num_steps": _EULER_STEPS}
+        few = how | {"num_steps": 10}  # of Euler's method (ACMDM Appendix F)
         sample = lambda noise: text_to_motion.sample_text(network, schedule, condition, noise, **few)
         distance = text_to_motion.control_distance(trained.codec, mask, control)
         return text_to_motion.optimise_noise(sample, distance, noise, num_steps=bench.settings["optimise_steps"]).state
@@ -331,10 +326,7 @@ def control_rows(bench: Bench, trained: TextModel, row: Mapping, about: Mapping,
     real, section = bench.real, row["section"]
     joints = text_models.controlled_joints(real.skeleton) if trained.branch is None else trained.controlled
     num_joints, key = real.skeleton.num_joints, jax.random.key(bench.seed)
-
-    def asked_of(joints, frames):
-        return frames[..., None] & np.isin(np.arange(num_joints), joints)
-
+    asked_of = lambda joints, frames: frames[..., None] & np.isin(np.arange(num_joints), joints)
     if section == "upper-body edit":
         held = asked_of([joints[name] for name in HELD], np.arange(max(real.lengths)) < real.lengths[:, None])
 
@@ -378,8 +370,6 @@ def median_seconds(ask: Callable, count: int) -> float:
 
 # ------------------------------------------------------------------------------------------------------------ MotionPCM
 
-_SENTENCES = 30
-
 
 def sentence_seconds(bench: Bench, trained: LatentModel, draw: Callable) -> float:
     """Return the seconds of one sentence by itself, from caption to vectors of a frame; joints are not counted.
@@ -388,7 +378,7 @@ def sentence_seconds(bench: Bench, trained: LatentModel, draw: Callable) -> floa
     """
     told, mask = bench.captions(0)[0], frame_mask([trained.most_frames], trained.most_frames)
     embed = lambda number: embed_captions([told[number % len(told)]], bench.encoder).pooled
-    return median_seconds(lambda number: draw(embed(number), mask, jax.random.key(number)), _SENTENCES)
+    return median_seconds(lambda number: draw(embed(number), mask, jax.random.key(number)), 30)
 
 
 def latent_rows(bench: Bench, trained: LatentModel | None, row: Mapping, about: Mapping, first) -> pd.DataFrame:
@@ -561,20 +551,15 @@ def measure_text_table(
             share = load_paper_file("recipes", stage.settings.paper)[f"short-{stage.recipe}"].get("share", 1.0)
             steps = max(1, round(motions / where["batch_size"] / share))
             brief = dataclasses.replace(profile, train_steps=steps, seed=seed)
-            own = {setting: where[setting] for setting in ("batch_size", "learning_rate")}
-            config = dataclasses.asdict(stage_recipe(stage.settings, stage.recipe, brief, base, **own))
-            if ships := text_models.shipped_for(preset, data, encoder, LatentModel) if latent else None:
-                if ships.record["identity"]["training"] == config:
-                    return ships
-            if below := stands_on(preset):
-                # What ships holds it, perhaps beneath a model of this very name, and is the same on all machines.
-                ships = (text_models.shipped_file(one, data, encoder) for one in (below, preset))
-                where["teacher"] = next(filter(None, ships), None)
+            recipe = {setting: where[setting] for setting in ("batch_size", "learning_rate")}
+            recipe = dataclasses.asdict(stage_recipe(stage.settings, stage.recipe, brief, base, **recipe))
+            ships = lambda name: text_models.shipped_for(name, data, encoder) if latent else None
+            if (found := ships(preset)) and found.record["identity"]["training"] == recipe:
+                return found
+            if below := stands_on(preset):  # a teacher that ships holds its autoencoder
+                where["teacher"] = (found if stage_of(preset) == "latent denoiser" else ships(below)) or trained(below)
                 if where["teacher"] is None:
-                    if trained(below) is None:
-                        return None
-                    once = apart / f"seed{profile.seed}-1"
-                    where["teacher"] = text_models.text_model_files(profile, below, folder=once).model
+                    return None
             return train_stage(data if latent else cut, encoder, brief, preset, **where)
         if form.latent and "autoencoder_steps" in settings:
             steps = dataclasses.replace(profile, train_steps=settings["autoencoder_steps"])
@@ -585,9 +570,7 @@ def measure_text_table(
 
     rows = [row for row in rows if not asked or row["model"] in asked]
     if plan:
-        once = [(row, profile.seed, 1.0) for row in rows]
-        every = planned(once, settings, name in settings["compared"])
-        rows = [row | {"seed": seed, "length": length} for row, seed, length in every]
+        rows = planned(rows, profile.seed, settings, name in settings["compared"])
     watched = partial(_watched, profile, apart) if plan else None
     return measure_rows(name, rows, about, records, bench, trained, leg.get("stop_at"), watched)
 
@@ -601,8 +584,7 @@ def _watched(profile: Profile, folder: Path, row: Mapping, model) -> tuple[dict,
     if not history.exists():
         history = text_models.PRETRAINED_DIR / profile.dataset / "text" / history.name  # that of what ships
     loss = read_table(history)[0]["held_out_loss"].dropna().iloc[-1]
-    size = optax.tree.size(_judged(model))
-    return {"parameters": size}, pd.DataFrame([{"metric": "held_out_loss", "value": loss}])
+    return {"parameters": optax.tree.size(_judged(model))}, pd.DataFrame([{"metric": "held_out_loss", "value": loss}])
 
 
 def measure_rows(
@@ -652,28 +634,24 @@ def measure_rows(
     return records.path(name)
 
 
-def planned(once: Iterable[tuple[Mapping, int, float]], settings: Mapping, compared: bool) -> list[tuple]:
-    """Return (row, seed, length) of all trainings of a table, in order: first what a verdict on orders asks for.
+def planned(rows: Sequence[Mapping], seed: int, settings: Mapping, compared: bool) -> list[dict]:
+    """Return a row with seed and length for each training of a table, in order: first what verdicts on orders ask for.
 
     Rows that are `compared` have all seeds at half and at full length; other lengths have the first seed. Real motion
     has no length.
     """
-    seeds, lengths = range(settings["seeds"] if compared else 1), settings["lengths"]
-    asked, rest = ([one for one in lengths if (one in (0.5, 1.0)) is first] for first in (True, False))
-    every = itertools.chain(itertools.product(seeds, once, (asked,)), itertools.product((0,), once, (rest,)))
-    made = [(row, seed + number, length) for number, (row, seed, _), lengths in every for length in lengths]
-    return [(row, seed, 0.0) for row, seed, _ in once if row["trained"] == REAL] + [
-        one for one in made if one[0]["trained"] != REAL
-    ]
+    asked, rest = ([one for one in settings["lengths"] if (one in (0.5, 1.0)) is first] for first in (True, False))
+    real, made = ([row for row in rows if (row["trained"] == REAL) is first] for first in (True, False))
+    seeds = range(seed, seed + (settings["seeds"] if compared else 1))
+    every = (([seed], real, [0.0]), (seeds, made, asked), ([seed], made, rest))
+    every = itertools.chain.from_iterable(itertools.product(*each) for each in every)
+    return [row | {"seed": seed, "length": length} for seed, row, length in every]
 
 
 # --------------------------------------------------------------------------------------------------------- the probes
 
 TREMBLE = 0.02
 """Deviation of the noise on every coordinate of every joint of trembling motion, metres."""
-
-SEEDS = {"smoke": 2}
-"""Motions of each caption in `measure_hands`, by profile; 50 in all others."""
 
 HAND_FRAMES, EULER_STEPS = 80, 20
 """Length of the motions in `measure_hands`, four seconds, and the steps in which a flow makes them."""
@@ -736,8 +714,7 @@ def measure_judge(data: TextMotions, encoder: TextEncoder, profile: Profile, *, 
     bench = bench_of(data, encoder, profile, **leg)
     if bench is None:
         return None
-    others = data.cut(bench.settings["most_frames"])
-    others = others.select(others.members("train"))
+    others = data.select(data.members("train")).cut(bench.settings["most_frames"])
     table = bench.judged(probes_of(bench.real, others, bench.seed), bench.settings["repeats"])
     record = bench.record(profile, data, "text_judge", tremble=TREMBLE)
     return write_table(records_folder(profile) / "text_judge.csv", table, record)
@@ -775,7 +752,7 @@ def _clip_rows(data: TextMotions, mirrored: bool) -> pd.DataFrame:
 
 def _told_rows(trained, encoder: TextEncoder, profile: Profile) -> pd.DataFrame:
     """Count the hands of motions that a model makes of captions with training's wordings and with others."""
-    rows, count = [], SEEDS.get(profile.name, 50)
+    rows, count = [], 2 if profile.name == "smoke" else 50
     steps = EULER_STEPS if trained.schedule.kind == "straight" else None
     for (content, side), wording in itertools.product(HAND_CONTENTS, ("training", "held out")):
         for action in caption_wordings(content, held_out=wording == "held out"):

@@ -7,6 +7,7 @@ found.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
@@ -35,7 +36,7 @@ from f3amd_lib.text.judge import text_metrics
 from f3amd_lib.text.stages.text_models import JUDGE, CaptionedModel, ClipsTask, load_text_model, save_text_model
 from f3amd_lib.training.checkpoints import network_with
 from f3amd_lib.training.optimise import TrainingState, frozen_tree, optimise
-from f3amd_lib.training.pipeline import ModelFiles
+from f3amd_lib.training.pipeline import ModelFiles, alone_with
 from f3amd_lib.training.recipe import check_settings
 
 # ------------------------------------------------------------------------------------------ network
@@ -385,14 +386,17 @@ def train_judge(
     Args:
       data, encoder, training, **sizes: as in `judge_task`.
       files: where it is kept; by default nowhere.
-      progress: show a progress bar.
-      stop_at: as for `optimise`; where it comes first, the answer is None.
+      progress, stop_at: as for `optimise`; where that time comes first, the answer is None.
+
+    Raises:
+      ValueError: if another process trains it there.
     """
     if files and files.model.exists():
         return load_judge(files.model)
     training, checkpoint = training or EvaluatorTraining(), files and files.state
     task, normaliser = judge_task(data, encoder, training, **sizes)
-    state, history = optimise(task, checkpoint=checkpoint, checkpoint_every=200, stop_at=stop_at, progress=progress)
+    with alone_with(files) if files else contextlib.nullcontext():
+        state, history = optimise(task, checkpoint=checkpoint, checkpoint_every=200, stop_at=stop_at, progress=progress)
     if int(state.step) < training.num_steps:
         return None
     identity = {name: value for name, value in task.identity().items() if name != "dataset_fingerprint"}

@@ -421,11 +421,6 @@ def shipped_for(name: str, data: TextMotions, encoder: TextEncoder, *kinds: type
         return found if known == (data.fingerprint, encoder.identity) else None
 
 
-def shipped_file(name: str, data: TextMotions, encoder: TextEncoder) -> Path | None:
-    """Return the file of `shipped_for`."""
-    return shipped_for(name, data, encoder) and PRETRAINED_DIR / data.name / "text" / f"{name}.safetensors"
-
-
 def text_model_folders(dataset: str) -> list[Path]:
     """Return where models of a data set may lie, in the order of asking: gpu and laptop runs, then what is shipped."""
     own = [runs_dir(dataset, profile) / "text" for profile in ("gpu", "laptop")]

@@ -121,15 +121,14 @@ def train_stage(
         frames, so that all begin where a caption's motion will: at the origin.
       batch_size, learning_rate: instead of the recipe's.
       folder: where files go instead of `runs/`.
-      teacher: file that holds what it stands on, such as a student's teacher that ships, instead of training one.
+      teacher: model, or file of one, that holds what it stands on, such as a shipped teacher, instead of training it.
       **leg: stop_at and progress, as for `optimise`.
 
     Returns:
       The model as its file has it; None where `stop_at` came first.
 
     Raises:
-      ValueError: if a model or a state of other settings lies there, or what it stands on knows other data, or
-        the teacher is none of its.
+      ValueError: if a model or a state of other settings lies there, or what it stands on is another or of other data.
       TrainingDiverged: if the loss stops being a number.
     """
     base, branch = preset_and_branch(name)
@@ -138,11 +137,9 @@ def train_stage(
         raise ValueError(f"{preset.name} has no control branch: its states are of vertices, not of joints")
     name, acmdm = preset.name + branch, stage.settings is acmdm_training.TextMotionTraining
     data = data.cut(window) if acmdm and window and window < data.lengths.max() else data
-    before = None
-    if teacher is not None:
-        before = load_text_model(teacher)
-        holds = before.name, presets.find_preset(preset_and_branch(before.name)[0]).latent
-        if not earlier or earlier not in holds:
+    before = teacher if teacher is None or isinstance(teacher, TextModel | LatentModel) else load_text_model(teacher)
+    if before is not None:
+        if earlier not in {before.name, presets.find_preset(preset_and_branch(before.name)[0]).latent} - {""}:
             raise ValueError(f"{teacher}: holds {before.name}, and {name} needs {earlier or 'no earlier model'}")
         if not before.record["identity"]["dataset_fingerprint"].startswith(data.fingerprint):
             raise ValueError(f"{teacher}: was trained on other clips than these; leave --teacher out to train one")
@@ -163,8 +160,7 @@ def train_stage(
     if acmdm:
         codec = _codec_of_positions(data, preset) if before is None else before.codec
         settings["unit"] = max(1, UNIT // codec.frames_per_state)
-    own = None if branch else preset.name
-    config = stage_recipe(stage.settings, stage.recipe, profile, own, **settings)
+    config = stage_recipe(stage.settings, stage.recipe, profile, None if branch else preset.name, **settings)
     files = text_models.text_model_files(profile, name, folder=folder)
     lies = next((file for file in (files.model, files.state) if file.exists()), None)
     if lies and (forms := YOUNGER.intersection(preset.network)):
@@ -176,15 +172,14 @@ def train_stage(
     asked = text_models.Asked(data, encoder, preset, branch, config, before, codec, window)
     if files.model.exists():
         found = load_text_model(files.model)
-        if unlike := differences(stage.of(asked, None).identity(), found.record["identity"]):
-            lies = f"a model with other {'; '.join(unlike)} lies there"
-            raise ValueError(f"{files.model}: {lies}; move it away or name another folder (--out)")
+        if unlike := "; ".join(differences(stage.of(asked, None).identity(), found.record["identity"])):
+            raise ValueError(
+                f"{files.model}: a model with other {unlike} lies there; move it away or choose another --out"
+            )
         return found
     task, held_out = stage.of(asked, "train"), stage.of(asked, "validation").held_out()
-    record = run_record(
-        profile=profile, dataset=data, seed=config.seed, model=name, identity=task.identity(),
-        num_train_clips=len(data.members("train")),
-    )  # fmt: skip
+    told = {"model": name, "identity": task.identity(), "num_train_clips": len(data.members("train"))}
+    record = run_record(profile=profile, dataset=data, seed=config.seed, **told)
     with alone_with(files):
         state, _ = train_in_legs(task, files, record, held_out=held_out, **leg)
     if int(state.step) < config.num_steps:
