@@ -3,7 +3,7 @@
     python scripts/caption_strip.py      (needs the data set bandai: downloaded, or in F3AMD_DATA_DIR)
 
 It leaves the picture `captions.png` and the table `captions.csv`, which notebooks 19 and 21 show. Motion is drawn with
-the skeleton fitted to it, as `f3amd text` shows it; no foot is held.
+the skeleton fitted to it and standing people kept in place, as `f3amd text` shows it; no foot is held.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from f3amd_lib.measures.walking import slide_speed
 from f3amd_lib.motion.inverse_kinematics import fitted
 from f3amd_lib.motion.skeleton import Motion
 from f3amd_lib.text.data.text_encoders import load_text_encoder
-from f3amd_lib.text.sampling.captioned_motion import draw_motions, told_captions
+from f3amd_lib.text.sampling.captioned_motion import draw_motions, told_captions, without_gliding
 from f3amd_lib.text.stages.text_models import load_text_model, open_text_motions
 from f3amd_lib.training.pipeline import PRETRAINED_DIR
 
@@ -52,6 +52,7 @@ def real_clips(data) -> np.ndarray:
 
 def seen(skeleton, fps: float, positions: np.ndarray) -> tuple[Motion, dict]:
     """Return the motion that is shown of positions [T, J, 3], and what a viewer sees of it."""
+    positions = without_gliding(skeleton, positions, fps)
     motion, moved = fitted(Motion.from_positions(skeleton, positions, fps))
     bones = np.linalg.norm(positions[:, 1:] - positions[:, list(skeleton.parents)[1:]], axis=-1)
     true = np.linalg.norm(skeleton.offsets[1:], axis=-1)

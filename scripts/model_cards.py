@@ -225,7 +225,8 @@ def judge_card(path: Path, seen: tuple[pd.DataFrame, dict] | None) -> str:
     judge, wide, fields = load_judge(path), None, {}
     digest = weights_digest(judge.params)
     if seen is not None and seen[1]["judge_weights"] == digest:
-        wide, fields = _wide(seen[0].round({"value": 9}), "system", _OF_JUDGE), {"repeats": seen[1]["settings"]["repeats"]}
+        wide = _wide(seen[0].round({"value": 9}), "system", _OF_JUDGE)
+        fields = {"repeats": seen[1]["settings"]["repeats"]}
     return _filled("judge_card", path, judge, judge.params, wide, digest=digest, **fields)
 
 

@@ -9,12 +9,13 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.ndimage import binary_opening
 
 from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.motion.inverse_kinematics import fitted
 from f3amd_lib.motion.root_paths import read_points_csv
 from f3amd_lib.motion.rotations import matrix_from_yaw
-from f3amd_lib.motion.skeleton import Motion
+from f3amd_lib.motion.skeleton import Motion, Skeleton
 from f3amd_lib.text.data.redundant import smoothed_yaw
 from f3amd_lib.text.data.text_encoders import check_captions, check_words, embed_captions
 from f3amd_lib.text.data.text_motions import FEWEST_FRAMES, UNIT, frame_mask
@@ -26,6 +27,9 @@ from f3amd_lib.training.checkpoints import network_with
 
 NEAR = 4
 """Starts of a stream among which the seed chooses: those whose captions are nearest to the first one."""
+
+STANDING = 0.45
+"""Toes whose speeds over the ground differ by less for a second or longer do not walk, metres a second (ours)."""
 
 STREAM_PRESET = "ACMDM-n4-PS22-prefix"
 """The model of the prefix form that two cores can train."""
@@ -180,20 +184,34 @@ def animate(
             how["control"] = control_of(trained, which, frames, points, num_frames)
         positions = draw_motions(trained, pooled, num_frames, key, **how)[0]
         if control is None:  # whose points lie where they are
-            positions = positions - positions[0, 0] * (1, 0, 1)
+            positions = without_gliding(trained.skeleton, positions - positions[0, 0] * (1, 0, 1), trained.fps)
     motion, moved = fitted(Motion.from_positions(trained.skeleton, positions, trained.fps, ", then ".join(captions)))
     if control is not None:
         missed = np.linalg.norm(motion.positions[frames, which] - points, axis=-1)
     return Told(motion, boundaries, moved, missed)
 
 
+def without_gliding(skeleton: Skeleton, positions, fps: float) -> np.ndarray:
+    """Keep a person in place who stands: where both toes move alike for a second, that is taken from all joints (ours).
+
+    Who walks goes as far as before. Networks that make steps of the root glide a little with feet at rest.
+
+    Args:
+      skeleton: J joints, toes among them.
+      positions: [T, J, 3], metres.
+      fps: frames per second.
+    """
+    steps = np.diff(positions[:, list(skeleton.toes)], axis=0) * (1, 0, 1)
+    alike = np.linalg.norm(steps[:, 0] - steps[:, 1], axis=-1) * fps < STANDING
+    glides = np.where(binary_opening(alike, np.ones(round(fps)))[:, None], steps.mean(axis=1), 0.0)
+    return positions - np.cumsum(np.pad(glides, ((1, 0), (0, 0))), axis=0)[:, None]
+
+
 def _asked(trained: TextModel, guidance: float | None, num_steps: int | None) -> dict:
     """Return what the samplers are told: a guidance, asked for or the model's own, and Euler's steps where given."""
     guidance = trained.record.get("guidance") if guidance is None else guidance
     told = {} if guidance is None else {"guidance": guidance}
-    if num_steps is None:
-        return told
-    return told | {"sampler": trained.schedule.sampler, "num_steps": num_steps}
+    return told if num_steps is None else told | {"sampler": trained.schedule.sampler, "num_steps": num_steps}
 
 
 def motion_drawer(
@@ -212,10 +230,9 @@ def motion_drawer(
     """
     config, schedule = trained.config, trained.schedule
     asked = _asked(trained, guidance, num_steps)
-    weights = {"network": trained.params}
     if controlled:
         trained.control_branch()  # says how to train one if there is none
-        weights["branch"] = trained.branch
+    weights = {"network": trained.params, "branch": trained.branch if controlled else None}
 
     @jax.jit
     def compiled(weights, codec, pooled, mask, noise, key, control):
@@ -274,8 +291,7 @@ def draw_motions(
     if trained.starts:
         raise ValueError(f"{trained.name} goes on from earlier frames: stream it (--then), or name another --model")
     how = {"guidance": guidance, "num_steps": num_steps, "controlled": control is not None, "mesh": mesh}
-    draw = draw or motion_drawer(trained, **how)
-    lengths = np.broadcast_to(num_frames, len(pooled))
+    lengths, draw = np.broadcast_to(num_frames, len(pooled)), draw or motion_drawer(trained, **how)
     mask = frame_mask(lengths, int(lengths.max()))
     made = np.asarray(draw(pooled, mask, key, control))
     return trained.codec.axes.restore(made) * np.asarray(mask)[..., None, None]
@@ -331,8 +347,7 @@ def stream_motions(
 
     metres = lambda normalised: codec.axes.restore(np.asarray(normalised, np.float64)[0])
     parts = [metres(codec.decode(jnp.asarray(chosen), jnp.ones((1, given), bool)))]
-    told = [caption for caption, count in zip(pooled, windows, strict=True) for _ in range(count)]
-    for number, caption in enumerate(told, 1):
+    for number, caption in enumerate(np.repeat(pooled, windows, axis=0), 1):
         before = np.concatenate(parts)[-given:]
         place = before[0, 0] * [1.0, 0.0, 1.0]
         turned = matrix_from_yaw(smoothed_yaw(trained.skeleton, before[:1], 0.0)[0])

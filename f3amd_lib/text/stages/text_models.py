@@ -423,8 +423,7 @@ def shipped_for(name: str, data: TextMotions, encoder: TextEncoder, *kinds: type
 
 def text_model_folders(dataset: str) -> list[Path]:
     """Return where models of a data set may lie, in the order of asking: gpu and laptop runs, then what is shipped."""
-    own = [runs_dir(dataset, profile) / "text" for profile in ("gpu", "laptop")]
-    return [*own, PRETRAINED_DIR / dataset / "text"]
+    return [*(runs_dir(dataset, profile) / "text" for profile in ("gpu", "laptop")), PRETRAINED_DIR / dataset / "text"]
 
 
 def named_model(name: str, num_steps: int | None = None) -> str:
