@@ -174,7 +174,7 @@ def laplacian_surface_distance(vertices, rest, faces) -> np.ndarray:
     Returns:
       Mean over vertices, [...].
 
-    Source: named in ACMDM section 4.5 and Table 4, without a formula; this one is ours.
+    Source: named in ACMDM section 4.1, Appendix B and Table 4, without a formula; this one is ours.
     """
     pairs = np.asarray(faces)[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     edges = coo_array((np.ones(2 * len(pairs)), np.concatenate([pairs, pairs[:, ::-1]]).T), [len(rest)] * 2).tocsr()
