@@ -105,7 +105,8 @@ def _text() -> dict[str, str]:
     told |= {name: f"{four[(*row, 'text_FID')]:.0f}" for name, row in zip(names, rows, strict=True)}
     for name, model in (("without", "-lambda0"), ("papers", ""), ("strong", "-lambda1")):
         told[f"{name}_discriminator_fid"] = f"{two[f'MotionPCM-M1{model}', 'text_FID']:.1f}"
-    return told | {"motionlcm_fid": f"{one['MotionLCM-V2', 1, 'text_FID']:.1f}"}
+    students = {"motionpcm_fid": "MotionPCM-M1", "motionlcm_fid": "MotionLCM-V2"}
+    return told | {name: f"{one[model, 1, 'text_FID']:.1f}" for name, model in students.items()}
 
 
 def _training() -> dict[str, str]:
