@@ -50,7 +50,8 @@ def measured_table(dataset: str, name: str, measurement: str) -> tuple[pd.DataFr
     table.attrs["dataset"] = record["dataset"]
     where = f"data {record['dataset']}, profile {record['profile']}, {machine_of(record)}"
     if "length" in table:
-        where += f" Means over seeds, {table['seeds'].min()} to {table['seeds'].max()} a row."
+        counts = sorted({*table.loc[table["length"] > 0, "seeds"]})
+        where += f" Means over {' or '.join(map(str, counts))} trainings."
     sentence = f"Stored result `{name}`: {where} {record['dataset_credit'] or ''}"
     if table.attrs["stale"]:
         sentence = f"**Stale: {table.attrs['stale']}; measure it again.** {sentence}"
