@@ -19,9 +19,9 @@ from page_tables import fill_tables
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this tree's library, whatever is installed
 
 from f3amd_notebooks.quality_tables import committed_quality
-from f3amd_notebooks.stored_result import table_of_seeds
 
 from f3amd_companion.ledger.claims import load_claims
+from f3amd_companion.ledger.evidence import of_seeds
 from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.ground.tables import markdown_table
 from f3amd_lib.networks.presets import find_preset
@@ -97,7 +97,7 @@ def _quality() -> dict[str, str]:
 
 def _text() -> dict[str, str]:
     keys = (["model", "steps", "metric"], ["model", "metric"], ["model", "steps", "metric"])
-    one, two, four = (table_of_seeds("bandai", f"text_pcm{n}")[0].set_index(key)["value"]
+    one, two, four = (of_seeds(pd.read_csv(RECORDS / f"text_pcm{n}.csv"), key).set_index(key)["value"]
                       for n, key in zip((1, 2, 4), keys, strict=True))  # fmt: skip
     told = {"caption_ms": f"{1000 * one['MotionPCM-M1', 1, 'sampling_seconds']:.0f}"}
     rows = (("MotionPCM-teacher", 50), ("MotionPCM-teacher", 1), ("MotionPCM-M1", 1))

@@ -3,12 +3,10 @@
 from pathlib import Path
 
 import pandas as pd
-from f3amd_companion.ledger.evidence import of_seeds
 from f3amd_lib.ground.names import counted_cores
 from f3amd_lib.ground.profiles import repository_root
 from f3amd_lib.ground.records import committed_table, read_table
 from f3amd_lib.ground.tables import markdown_table
-from f3amd_lib.papers.printed import SCHEMAS
 from IPython.display import Image
 
 
@@ -19,16 +17,6 @@ def stored_result(dataset: str, name: str) -> str:
     frame, record = found
     where = f"profile {record['profile']}, data {record['dataset']}, {machine_of(record)}"
     return f"Stored result: `{name}`, {where}\n\n{markdown_table(frame, digits=2)}"
-
-
-def table_of_seeds(dataset: str, name: str) -> tuple[pd.DataFrame, dict] | None:
-    """Return what `committed_table` does; where a table has seeds, their means after the whole length."""
-    if (found := committed_table(dataset, name)) is None or not {"seed", "length"} <= {*found[0]}:
-        return found
-    table, record = found
-    means = of_seeds(table, SCHEMAS[name])
-    means.attrs.update(table.attrs)
-    return means, record
 
 
 def measured_table(dataset: str, name: str, measurement: str) -> tuple[pd.DataFrame | None, str]:
@@ -43,15 +31,12 @@ def measured_table(dataset: str, name: str, measurement: str) -> tuple[pd.DataFr
       (table or None, a sentence: data, profile, machine, date and credit, or how to measure it).
       `table.attrs["dataset"]` names the data set that was measured.
     """
-    found = table_of_seeds(dataset, name) or table_of_seeds("bandai", name)
+    found = committed_table(dataset, name) or committed_table("bandai", name)
     if found is None:
         return None, f"Not measured yet: `{name}`. `make measure MEASURE={measurement} DATA=bandai` measures it."
     table, record = found
     table.attrs["dataset"] = record["dataset"]
     where = f"data {record['dataset']}, profile {record['profile']}, {machine_of(record)}"
-    if "length" in table:
-        counts = sorted({*table.loc[table["length"] > 0, "seeds"]})
-        where += f" Means over {' or '.join(map(str, counts))} trainings."
     sentence = f"Stored result `{name}`: {where} {record['dataset_credit'] or ''}"
     if table.attrs["stale"]:
         sentence = f"**Stale: {table.attrs['stale']}; measure it again.** {sentence}"
