@@ -217,8 +217,9 @@ def test_what_cannot_be_trained_is_refused(folder, data, monkeypatch, name, mess
 
 def test_who_stands_does_not_glide_and_who_walks_goes_as_far(data):
     walk, glide = data.clip(0), np.arange(40)[:, None, None] * (0.01, 0.0, 0.02)
-    kept = lambda positions: captioned_motion.without_gliding(data.skeleton, positions, 20.0)
+    kept = lambda positions, skeleton=data.skeleton: captioned_motion.without_gliding(skeleton, positions, 20.0)
     np.testing.assert_array_equal(kept(walk), walk)
+    np.testing.assert_array_equal(kept(walk[:1] + glide, types.SimpleNamespace(roles={})), walk[:1] + glide)  # no toes
     np.testing.assert_allclose(kept(walk[:1] + glide), np.repeat(walk[:1], 40, axis=0), atol=1e-6)
 
 

@@ -222,10 +222,9 @@ def test_a_queue_stands_on_what_ships_and_takes_it_for_its_own_recipe_alone(data
     monkeypatch.setattr(text_tables, "measure_rows", seen)
     profile = dataclasses.replace(PROFILE, name="laptop", seed=0)
     measure_text_table("text_pcm4", data, ENCODER, profile, plan="queue", **QUIET)
-    trained = found[0]
     for name, model in shipped.items():
-        assert trained(name, 0, 1.0) is model and not asked
-        assert trained(name, 1, 1.0) is trained(name, 0, 0.5) is None
+        assert found[0](name, 0, 1.0) is model and not asked
+        assert found[0](name, 1, 1.0) is found[0](name, 0, 0.5) is None
         assert [(*one[:2], one[3]) for one in asked] == [(name, 1, TEACHER), (name, 0, TEACHER)]
         assert asked[0][2] == pytest.approx(2 * asked[1][2], abs=2)
         asked.clear()

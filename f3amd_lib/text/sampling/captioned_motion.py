@@ -28,9 +28,6 @@ from f3amd_lib.training.checkpoints import network_with
 NEAR = 4
 """Starts of a stream among which the seed chooses: those whose captions are nearest to the first one."""
 
-STANDING = 0.45
-"""Toes whose speeds over the ground differ by less for a second or longer do not walk, metres a second (ours)."""
-
 STREAM_PRESET = "ACMDM-n4-PS22-prefix"
 """The model of the prefix form that two cores can train."""
 
@@ -171,7 +168,7 @@ def animate(
         raise ValueError(f"{trained.name} makes whole motions of one caption: leave out --then and --control")
     pooled = told_captions(trained, encoder, captions, any_words=any_words)
     key, how = jax.random.key(seed), {"guidance": guidance, "num_steps": num_steps}
-    boundaries, missed = range(0), None
+    boundaries = range(0)
     if len(captions) > 1 or getattr(trained, "starts", ()):
         windows, starts = told_windows(trained, seconds), embed_captions(list(trained.starts), encoder).pooled
         positions = stream_motions(trained, pooled, [windows] * len(captions), key, starts=starts, **how)
@@ -186,23 +183,25 @@ def animate(
         if control is None:  # whose points lie where they are
             positions = without_gliding(trained.skeleton, positions - positions[0, 0] * (1, 0, 1), trained.fps)
     motion, moved = fitted(Motion.from_positions(trained.skeleton, positions, trained.fps, ", then ".join(captions)))
-    if control is not None:
-        missed = np.linalg.norm(motion.positions[frames, which] - points, axis=-1)
+    missed = None if control is None else np.linalg.norm(motion.positions[frames, which] - points, axis=-1)
     return Told(motion, boundaries, moved, missed)
 
 
 def without_gliding(skeleton: Skeleton, positions, fps: float) -> np.ndarray:
     """Keep a person in place who stands: where both toes move alike for a second, that is taken from all joints (ours).
 
-    Who walks goes as far as before. Networks that make steps of the root glide a little with feet at rest.
+    Who walks goes as far as before. Networks that make steps of the root glide a little with feet at rest. Alike are
+    speeds over the ground that differ by less than 0.45 m/s; of a skeleton without toes nothing changes.
 
     Args:
-      skeleton: J joints, toes among them.
+      skeleton: J joints.
       positions: [T, J, 3], metres.
       fps: frames per second.
     """
+    if not {"left_toe", "right_toe"} <= {*skeleton.roles}:
+        return positions
     steps = np.diff(positions[:, list(skeleton.toes)], axis=0) * (1, 0, 1)
-    alike = np.linalg.norm(steps[:, 0] - steps[:, 1], axis=-1) * fps < STANDING
+    alike = np.linalg.norm(steps[:, 0] - steps[:, 1], axis=-1) * fps < 0.45
     glides = np.where(binary_opening(alike, np.ones(round(fps)))[:, None], steps.mean(axis=1), 0.0)
     return positions - np.cumsum(np.pad(glides, ((1, 0), (0, 0))), axis=0)[:, None]
 
