@@ -180,7 +180,7 @@ def test_a_window_shorter_than_the_clips_takes_their_first_frames(data, tmp_path
         return types.SimpleNamespace(step=0), []
 
     monkeypatch.setattr(train_stage, "train_in_legs", loop)
-    monkeypatch.setitem(presets.PRESETS, "tiny", TINY["tiny"])
+    monkeypatch.setattr(presets, "PRESETS", presets.PRESETS | TINY)
     train = functools.partial(train_stage.train_stage, data, ENCODER, PROFILE, folder=tmp_path, window=32, **QUIET)
     assert train("tiny") is None
     refused("no train clip has 64 frames, the longest .*32.*larger --window", train, "tiny-AE")
