@@ -147,9 +147,8 @@ class Bench:
         pooled, lengths = self.captions(0)[1][clips], self.real.lengths[clips]
         for number in range(-(-samples // at_once)):
             key = jax.random.fold_in(jax.random.key(self.seed), self.settings["repeats"] + number)
-            embedded = self.embed(
-                [one[:length] for one, length in zip(make(pooled, lengths, key), lengths, strict=True)]
-            )
+            motions = [one[:length] for one, length in zip(make(pooled, lengths, key), lengths, strict=True)]
+            embedded = self.embed(motions)
             made.append(embedded[: at_once * count].reshape(at_once, count, embedded.shape[-1]))
         made = np.swapaxes(np.concatenate(made)[:samples], 0, 1)
         far = text_metrics.multimodality(made, np.random.default_rng([self.seed, 4]))

@@ -346,7 +346,8 @@ def stream_motions(
 
     metres = lambda normalised: codec.axes.restore(np.asarray(normalised, np.float64)[0])
     parts = [metres(codec.decode(jnp.asarray(chosen), jnp.ones((1, given), bool)))]
-    for number, caption in enumerate(np.repeat(pooled, windows, axis=0), 1):
+    told = [caption for caption, count in zip(pooled, windows, strict=True) for _ in range(count)]
+    for number, caption in enumerate(told, 1):
         before = np.concatenate(parts)[-given:]
         place = before[0, 0] * [1.0, 0.0, 1.0]
         turned = matrix_from_yaw(smoothed_yaw(trained.skeleton, before[:1], 0.0)[0])

@@ -172,10 +172,9 @@ def train_stage(
     asked = text_models.Asked(data, encoder, preset, branch, config, before, codec, window)
     if files.model.exists():
         found = load_text_model(files.model)
-        if unlike := "; ".join(differences(stage.of(asked, None).identity(), found.record["identity"])):
-            raise ValueError(
-                f"{files.model}: a model with other {unlike} lies there; move it away or choose another --out"
-            )
+        if unlike := differences(stage.of(asked, None).identity(), found.record["identity"]):
+            lies = f"a model with other {'; '.join(unlike)} lies there"
+            raise ValueError(f"{files.model}: {lies}; move it away or name another folder (--out)")
         return found
     task, held_out = stage.of(asked, "train"), stage.of(asked, "validation").held_out()
     told = {"model": name, "identity": task.identity(), "num_train_clips": len(data.members("train"))}
