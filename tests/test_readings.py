@@ -68,7 +68,9 @@ def test_losses_of_several_readings_add_up_and_the_same_one_twice_is_refused():
 def test_camdm_in_its_own_units_keeps_its_losses_and_no_other_change_of_them():
     loss = find_recipe("CAMDM-units").on("CAMDM").config(10, 4, 0).loss
     assert loss.raw_features and loss.ird == 0.0
-    refused("loss", find_recipe("IRD-squared").on, "CAMDM")
+    for recipe, why in (("IRD-squared", "loss"), ("small-spectral-weights", "spectral")):
+        refused(why, find_recipe(recipe).on, "CAMDM")
+    assert find_recipe("small-spectral-weights").on("F3AMD-Transformer-64").preset == "F3AMD-Transformer-64"
 
 
 def test_spectral_weights_of_li_et_al_begin_small_and_positive():

@@ -119,9 +119,10 @@ class Recipe:
         Raises:
           ValueError: if the row changes one of these.
         """
-        # Units of the loss are any model's.
+        # Units of the loss are any model's, and small spectral weights any model's of the family.
+        shared = {"small_spectral_weights"} if presets.find_preset(preset).family == "F3AMD" else set()
         also = {"loss": self.loss.keys() - {"raw_features"}, "diffusion": "diffusion" in self.training}
-        own = [*self.network, *filter(also.get, also)]
+        own = [*(self.network.keys() - shared), *filter(also.get, also)]
         if preset != self.preset and (own or self.preset != Recipe.preset):
             what = f"its {', '.join(own)}" if own else "a recipe of its own"
             raise ValueError(f"{self.name} changes {what} of {self.preset}, so that it is no change of {preset}")
