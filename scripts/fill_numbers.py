@@ -21,9 +21,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this tree's libr
 from f3amd_notebooks.quality_tables import committed_quality
 
 from f3amd_companion.ledger.claims import load_claims
-from f3amd_companion.ledger.evidence import of_seeds
 from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.ground.tables import markdown_table
+from f3amd_lib.measures.distributions import of_seeds
 from f3amd_lib.networks.presets import find_preset
 from f3amd_lib.training.checkpoints import load_model
 from f3amd_lib.training.pipeline import PRETRAINED_DIR

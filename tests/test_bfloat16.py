@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from builders import CHANNELS, WINDOW, draw, make_condition, network_of, tiny_config
 
-from f3amd_lib.networks.config import cast_network
+from f3amd_companion.speed.implementations import cast_network
 
 
 @pytest.mark.slow

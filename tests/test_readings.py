@@ -86,8 +86,7 @@ def _network(**fields):
 
 def test_a_bypass_adds_each_blocks_input_and_changes_nothing_else():
     plain, bypass = _network(), _network(block_bypass=True)
-    rng = np.random.default_rng(0)
-    draw = lambda *shape: jnp.asarray(rng.normal(size=shape), jnp.float32)
+    draw = lambda *shape, rng=np.random.default_rng(0): jnp.asarray(rng.normal(size=shape), jnp.float32)
     condition, x = Condition(draw(1, 10, CHANNELS), draw(1, 8, 8), jnp.eye(2)[:1]), draw(1, 8, CHANNELS)
     stations = [dict(net.stages(x, 1.0, net.encode(condition))) for net in (plain, bypass)]
     np.testing.assert_allclose(stations[1]["block 1"], stations[0]["block 1"] + stations[0]["encoder"], atol=1e-5)
@@ -95,12 +94,11 @@ def test_a_bypass_adds_each_blocks_input_and_changes_nothing_else():
 
 
 def test_a_coordinate_tells_the_encoder_where_a_frame_is():
-    network, x = _network(coordinate_channel=True, kernel_size=1), jnp.zeros((1, 8, CHANNELS))
+    x = jnp.zeros((1, 8, CHANNELS))
     condition = Condition(jnp.zeros((1, 10, CHANNELS)), jnp.zeros((1, 8, 8)), jnp.eye(2)[:1])
-    encoded = {}
-    for name, net in (("with", network), ("without", _network(kernel_size=1))):
-        encoded[name] = np.asarray(dict(net.stages(x, 1.0, net.encode(condition)))["encoder"])
-    assert np.ptp(encoded["without"], axis=1).max() < 1e-5 < np.ptp(encoded["with"], axis=1).max()
+    networks = [_network(coordinate_channel=told, kernel_size=1) for told in (False, True)]
+    encoded = [dict(net.stages(x, 1.0, net.encode(condition)))["encoder"] for net in networks]
+    assert np.ptp(encoded[0], axis=1).max() < 1e-5 < np.ptp(encoded[1], axis=1).max()
 
 
 # ------------------------------------------------------------------------------------------- queue, plan and measures

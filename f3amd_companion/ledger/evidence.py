@@ -19,7 +19,7 @@ from f3amd_lib.ground.names import asked_network, check_known, counted_cores, ne
 from f3amd_lib.ground.papers import load_paper_file, load_paper_table, paper_folders
 from f3amd_lib.ground.profiles import DATASETS, PROFILES
 from f3amd_lib.ground.records import folder_reason, read_table
-from f3amd_lib.measures.distributions import intervals_over_repeats, mean_and_interval
+from f3amd_lib.measures.distributions import intervals_over_repeats, of_seeds
 from f3amd_lib.measures.walking import CHECKS
 from f3amd_lib.networks import presets
 from f3amd_lib.papers.printed import PUBLISHED_CAMDM, SCHEMAS, printed_tables
@@ -371,22 +371,6 @@ def recorded_evidence(root, dataset: str, profile: str) -> Evidence:
         return table, record, path.relative_to(root).as_posix()
 
     return Evidence(load, at=lambda share: Evidence(functools.partial(load, length=share)))
-
-
-def of_seeds(table: pd.DataFrame, keys: Sequence[str], length: float = 1.0) -> pd.DataFrame:
-    """Return a table after so much of the usual length, 0 of which has no training: means over `seeds` of each row.
-
-    An interval is that of the seeds, or of the repeats of one, where that is the wider. A table without lengths and
-    seeds has one.
-    """
-    if not {"seed", "length"} <= {*table}:
-        return table.assign(seeds=1) if length == 1.0 else table[:0]
-    found = []
-    for _, rows in table[table["length"].isin([0.0, length])].groupby(list(keys), sort=False, dropna=False):
-        over, repeats = mean_and_interval(rows["value"]), rows[["low", "high"]].mean()
-        bounds = {"low": np.fmin(over["low"], repeats["low"]), "high": np.fmax(over["high"], repeats["high"])}
-        found.append({**rows.iloc[0], "value": over["value"], **bounds, "seeds": rows["seed"].nunique()})
-    return pd.DataFrame(found, columns=[*table, "seeds"])
 
 
 def _evidence_of(tables: Mapping[str, pd.DataFrame], record: Mapping, where: str, gap: str, **framework) -> Evidence:

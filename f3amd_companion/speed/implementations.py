@@ -14,6 +14,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+from flax import nnx
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from f3amd_companion.speed.fft_reference import fft_reference
@@ -22,8 +23,19 @@ from f3amd_lib.diffusion.samplers import num_evaluations
 from f3amd_lib.ground.names import check_known
 from f3amd_lib.networks import presets
 from f3amd_lib.networks.conditioning import PATH_CHANNELS, Condition
-from f3amd_lib.networks.config import NetworkConfig, cast_network
+from f3amd_lib.networks.config import NetworkConfig
 from f3amd_lib.rollout.rounds import sample_round
+
+
+def cast_network(network: nnx.Module, dtype) -> nnx.Module:
+    """Return a network whose weights, and with them its arithmetic, are of another type.
+
+    Args:
+      network: any; left as it is.
+      dtype: of floating-point numbers. Condition and state must be given in it, too.
+    """
+    graph, state = nnx.split(network)
+    return nnx.merge(graph, jax.tree.map(lambda leaf: leaf.astype(dtype), state))
 
 
 class NotPossible(RuntimeError):

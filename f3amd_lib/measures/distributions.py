@@ -179,8 +179,7 @@ def style_coverage(generated_counts, target_counts) -> float:
     Source: paper section 4.4 (Style Coverage). Our reading: counts are of 60-frame windows, and
     the wanted ones are those of the rollout's own length.
     """
-    generated = np.asarray(generated_counts, np.float64)
-    target = np.asarray(target_counts, np.float64)
+    generated, target = (np.asarray(counts, np.float64) for counts in (generated_counts, target_counts))
     if generated.shape != target.shape or not target.sum() > 0:
         raise ValueError(f"counts must be [S] on both sides, some wanted, got {generated} and {target}")
     return float(100.0 * np.minimum(generated, target).sum() / target.sum())
@@ -298,9 +297,24 @@ def intervals_over_repeats(rows: pd.DataFrame, columns: Sequence[str]) -> pd.Dat
       The columns, then those of `mean_and_interval`.
     """
     groups = rows.groupby(list(columns), sort=False)["value"]
-    return pd.DataFrame(
-        [dict(zip(columns, key, strict=True)) | mean_and_interval(values.to_numpy()) for key, values in groups]
-    )
+    made = [dict(zip(columns, key, strict=True)) | mean_and_interval(values.to_numpy()) for key, values in groups]
+    return pd.DataFrame(made)
+
+
+def of_seeds(table: pd.DataFrame, keys: Sequence[str], length: float = 1.0) -> pd.DataFrame:
+    """Return a table after so much of the usual length, 0 of which has no training: means over `seeds` of each row.
+
+    An interval is that of the seeds, or of the repeats of one, where that is the wider. A table without lengths and
+    seeds has one.
+    """
+    if not {"seed", "length"} <= {*table}:
+        return table.assign(seeds=1) if length == 1.0 else table[:0]
+    found = []
+    for _, rows in table[table["length"].isin([0.0, length])].groupby(list(keys), sort=False, dropna=False):
+        over, repeats = mean_and_interval(rows["value"]), rows[["low", "high"]].mean()
+        bounds = {"low": np.fmin(over["low"], repeats["low"]), "high": np.fmax(over["high"], repeats["high"])}
+        found.append({**rows.iloc[0], "value": over["value"], **bounds, "seeds": rows["seed"].nunique()})
+    return pd.DataFrame(found, columns=[*table, "seeds"])
 
 
 # --------------------------------------------------------------------------------------- settling

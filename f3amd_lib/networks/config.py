@@ -178,14 +178,3 @@ class DenoisingNetwork(nnx.Module):
         """
         *_, (_, x0_hat) = self.stages(x_noisy, sigma, context, key)
         return x0_hat
-
-
-def cast_network(network: nnx.Module, dtype) -> nnx.Module:
-    """Return a network whose weights, and with them its arithmetic, are of another type.
-
-    Args:
-      network: any; left as it is.
-      dtype: of floating-point numbers. Condition and state must be given in it, too.
-    """
-    graph, state = nnx.split(network)
-    return nnx.merge(graph, jax.tree.map(lambda leaf: leaf.astype(dtype), state))

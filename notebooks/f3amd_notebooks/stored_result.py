@@ -7,6 +7,8 @@ from f3amd_lib.ground.names import counted_cores
 from f3amd_lib.ground.profiles import repository_root
 from f3amd_lib.ground.records import committed_table, read_table
 from f3amd_lib.ground.tables import markdown_table
+from f3amd_lib.measures.distributions import of_seeds
+from f3amd_lib.papers.printed import SCHEMAS
 from IPython.display import Image
 
 
@@ -28,13 +30,16 @@ def measured_table(dataset: str, name: str, measurement: str) -> tuple[pd.DataFr
       measurement: of `measure.MEASUREMENTS`, which writes it.
 
     Returns:
-      (table or None, a sentence: data, profile, machine, date and credit, or how to measure it).
-      `table.attrs["dataset"]` names the data set that was measured.
+      (table or None, a sentence: data, profile, machine, date and credit, or how to measure it). Of trainings of
+      several lengths and seeds, means over the seeds of the whole length. `table.attrs["dataset"]` names the data set.
     """
     found = committed_table(dataset, name) or committed_table("bandai", name)
     if found is None:
         return None, f"Not measured yet: `{name}`. `make measure MEASURE={measurement} DATA=bandai` measures it."
     table, record = found
+    if {"seed", "length"} <= {*table}:
+        attrs, table = table.attrs, of_seeds(table, SCHEMAS[name])
+        table.attrs = attrs
     table.attrs["dataset"] = record["dataset"]
     where = f"data {record['dataset']}, profile {record['profile']}, {machine_of(record)}"
     sentence = f"Stored result `{name}`: {where} {record['dataset_credit'] or ''}"
