@@ -58,17 +58,17 @@ def test_clean_frames_are_frames_at_time_one_and_may_be_remembered():
     times = jnp.broadcast_to(jnp.array([1.0, 1.0, 1.0, 1.0, 0.5, 0.5]), (3, 6))
     whole = network(x, times, None)[:, 4:]
     past = network.remember(x[:, 2:4], None, network.remember(x[:, :2], None))
-    np.testing.assert_allclose(network(x[:, 4:], 0.5, None, past=past), whole, atol=1e-4)
+    given = ExactFrames(COVARIANCE, prefix=4)(x, 0.5, None)[:, 4:]  # told one time for all frames
+    for found in (network(x[:, 4:], 0.5, None, past=past), given):
+        np.testing.assert_allclose(found, whole, atol=1e-4)
     assert not np.allclose(network(x[:, 4:], 0.5, None), whole, atol=1e-2)  # without them another answer
 
 
 def test_blocks_draw_the_frames_that_they_should():
     condition = TextCondition(jnp.zeros((4000, 1)), jnp.ones((4000, 6), bool))
     noise = jax.random.normal(jax.random.key(3), (4000, 6, 1, 1))
-    draw = lambda covariance: sample_blocks(
-        ExactFrames(covariance, block_frames=3), straight(), condition, noise, guidance=1.0, sampler="ddim",
-        num_steps=40,
-    )  # fmt: skip
-    found = np.cov(np.asarray(jax.jit(lambda: draw(COVARIANCE))())[..., 0, 0].T)
+    network, how = ExactFrames(COVARIANCE, block_frames=3), {"guidance": 1.0, "sampler": "ddim", "num_steps": 40}
+    draws = jax.jit(lambda: sample_blocks(network, straight(), condition, noise, **how))()
+    found = np.cov(np.asarray(draws)[..., 0, 0].T)
     np.testing.assert_allclose(found, COVARIANCE, atol=0.15)
     assert np.abs(np.cov(np.asarray(noise)[..., 0, 0].T) - COVARIANCE).max() > 0.5

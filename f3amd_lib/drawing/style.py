@@ -116,20 +116,17 @@ def save_figure(figure: Figure, path) -> Path:
     return write_whole(path, _few_colors(_png(figure, None), 256))
 
 
-def show_figure(figure: Figure, *, dpi: int = 100, colors: int | None = None, full: str = ""):
+def show_figure(figure: Figure, *, dpi: int = 100, colors: int | None = None):
     """Return the figure as an image that Jupyter shows when it is a cell's last value.
 
     Args:
       figure: what to show.
       dpi: dots an inch.
       colors: keep this many; a third of the bytes, of which a notebook has few.
-      full: of a light copy, the SHA-256 of the file in full size, by which the site finds it.
     """
     from IPython.display import Image as Shown
 
-    if colors is None:
-        return Shown(data=_png(figure, dpi))
-    return Shown(data=_few_colors(_png(figure, dpi), colors), metadata={"full": full} if full else None)
+    return Shown(data=_png(figure, dpi) if colors is None else _few_colors(_png(figure, dpi), colors))
 
 
 def keep_figure(figure: Figure, results, name: str, colors: int = 64, data: str = ""):
@@ -143,19 +140,24 @@ def keep_figure(figure: Figure, results, name: str, colors: int = 64, data: str 
       data: the data set that is shown or measured, to be named in the lower right corner; none in theory.
 
     Returns:
-      An image for a cell's last line: smaller, and in few colours.
+      An image for a cell's last line: smaller, and in few colours. Its metadata have the SHA-256 of the file in full
+      size, by which the site finds it.
     """
+    from IPython.display import Image as Shown
+
     if data:
         figure.supxlabel(f"data: {data}", x=0.995, ha="right", fontsize=7, color=PALETTE["grey"])
-    file = save_figure(figure, Path(results) / "figures" / f"{name}.png")
-    figure.set_layout_engine("none")  # everything stays where it was just laid out
-    return show_figure(figure, dpi=76, colors=colors, full=hashlib.sha256(file.read_bytes()).hexdigest())
+    png = save_figure(figure, Path(results) / "figures" / f"{name}.png").read_bytes()
+    # The same drawing, scaled: laid out again at fewer dots, labels would have other widths.
+    return Shown(data=_few_colors(png, colors, dpi=76), metadata={"full": hashlib.sha256(png).hexdigest()})
 
 
-def _few_colors(png: bytes, colors: int) -> bytes:
+def _few_colors(png: bytes, colors: int, dpi: int | None = None) -> bytes:
     whole, small = Image.open(io.BytesIO(png)), io.BytesIO()
-    few = whole.convert("RGB").quantize(colors, Image.Quantize.MAXCOVERAGE, kmeans=1, dither=Image.Dither.NONE)
-    few.save(small, "png", optimize=True, dpi=whole.info["dpi"])
+    scale = dpi / whole.info["dpi"][0] if dpi else 1
+    whole = whole.convert("RGB").resize([round(scale * side) for side in whole.size], Image.Resampling.LANCZOS)
+    few = whole.quantize(colors, Image.Quantize.MAXCOVERAGE, kmeans=1, dither=Image.Dither.NONE)
+    few.save(small, "png", optimize=True, dpi=[scale * dots for dots in whole.info["dpi"]])
     return small.getvalue()
 
 

@@ -68,11 +68,12 @@ class ExactFrames:
 
     Args:
       covariance: of the frames, [L, L]; their mean is 0.
-      block_frames, prefix: of the form; the samplers ask for these.
+      window, block_frames: of the form; the samplers ask for these.
+      prefix: first frames that are clean, whatever time is told; the prefix form has one time for all frames.
     """
 
-    def __init__(self, covariance, *, window: int | None = None, block_frames: int = 0):
-        self.covariance = jnp.asarray(covariance, jnp.float32)
+    def __init__(self, covariance, *, window: int | None = None, block_frames: int = 0, prefix: int = 0):
+        self.covariance, self.prefix = jnp.asarray(covariance, jnp.float32), prefix
         window = window or len(covariance)
         self.config = types.SimpleNamespace(
             objective="v", window=window, block_frames=block_frames, num_joints=1, channels=1
@@ -89,7 +90,7 @@ class ExactFrames:
     def __call__(self, state, time, context, *, past=None):
         """Return the exact velocity, [B, L, 1, 1]; time () or [B, L], alike for all samples; `past`: clean frames."""
         x = state[..., 0, 0]
-        t = jnp.broadcast_to(time, x.shape)[0]
+        t = jnp.broadcast_to(time, x.shape)[0].at[: self.prefix].set(1.0)
         if past is not None:
             x, t = jnp.concatenate([past[..., 0, 0], x], axis=1), jnp.pad(t, (len(past[0]), 0), constant_values=1.0)
         t = jnp.clip(t, 1e-3, 1.0)
