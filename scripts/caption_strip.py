@@ -29,7 +29,7 @@ from f3amd_lib.measures.walking import slide_speed
 from f3amd_lib.motion.inverse_kinematics import fitted
 from f3amd_lib.motion.skeleton import Motion
 from f3amd_lib.text.data.text_encoders import load_text_encoder
-from f3amd_lib.text.sampling.captioned_motion import draw_motions, told_captions, without_gliding
+from f3amd_lib.text.sampling.captioned_motion import as_shown, draw_motions, told_captions
 from f3amd_lib.text.stages.text_models import load_text_model, open_text_motions
 from f3amd_lib.training.pipeline import PRETRAINED_DIR
 
@@ -52,7 +52,6 @@ def real_clips(data) -> np.ndarray:
 
 def seen(skeleton, fps: float, positions: np.ndarray) -> tuple[Motion, dict]:
     """Return the motion that is shown of positions [T, J, 3], and what a viewer sees of it."""
-    positions = without_gliding(skeleton, positions, fps)
     motion, moved = fitted(Motion.from_positions(skeleton, positions, fps))
     bones = np.linalg.norm(positions[:, 1:] - positions[:, list(skeleton.parents)[1:]], axis=-1)
     true = np.linalg.norm(skeleton.offsets[1:], axis=-1)
@@ -92,6 +91,8 @@ def main() -> None:
         made[trained.name] = np.asarray(draw_motions(trained, pooled, FRAMES, jax.random.key(SEED)))
     columns, rows = {}, []
     for system, all_positions in made.items():
+        if system != "real clip":
+            all_positions = [as_shown(data.skeleton, positions, data.fps) for positions in all_positions]
         shown = [seen(data.skeleton, data.fps, positions) for positions in all_positions]
         columns[system] = [motion for motion, _ in shown]
         rows += [{"system": system, "caption": said, **row} for said, (_, row) in zip(CAPTIONS, shown, strict=True)]

@@ -107,7 +107,7 @@ def test_the_command_asks_the_shipped_student_once_with_its_own_weights_key_and_
     student = text_models.load_text_model(SHIPPED / "MotionPCM-M1-small.safetensors")
     pooled = embed_captions(["a person raises the left hand"], load_text_encoder()).pooled
     drawn = lambda guidance: latent_motions(student, pooled, 24, jax.random.key(3), guidance=guidance)[0]
-    wanted, other = (captioned_motion.without_gliding(student.skeleton, drawn(w), student.fps) for w in (14.0, 5.0))
+    wanted, other = (captioned_motion.as_shown(student.skeleton, drawn(w), student.fps) for w in (14.0, 5.0))
     # Joints are moved a little, so that bones keep their lengths.
     away = np.abs(motion.positions - wanted).mean()
     assert away < 0.03 and np.abs(motion.positions - other).mean() > 1.5 * away

@@ -215,12 +215,14 @@ def test_what_cannot_be_trained_is_refused(folder, data, monkeypatch, name, mess
     refused(message, train_stage.train_stage, data, ENCODER, PROFILE, name, folder=folder, **QUIET)
 
 
-def test_who_stands_does_not_glide_and_who_walks_goes_as_far(data):
-    walk, glide = data.clip(0), np.arange(40)[:, None, None] * (0.01, 0.0, 0.02)
-    kept = lambda positions, skeleton=data.skeleton: captioned_motion.without_gliding(skeleton, positions, 20.0)
-    np.testing.assert_array_equal(kept(walk), walk)
-    np.testing.assert_array_equal(kept(walk[:1] + glide, types.SimpleNamespace(roles={})), walk[:1] + glide)  # no toes
-    np.testing.assert_allclose(kept(walk[:1] + glide), np.repeat(walk[:1], 40, axis=0), atol=1e-6)
+def test_what_is_shown_trembles_less_and_who_stands_does_not_glide_and_who_walks_goes_as_far(data):
+    walk, glide = data.clip(0) - data.clip(0)[0, 0] * (1, 0, 1), np.arange(40)[:, None, None] * (0.01, 0.0, 0.02)
+    shown = lambda positions, skeleton=data.skeleton: captioned_motion.as_shown(skeleton, positions, 20.0)
+    assert np.linalg.norm(shown(walk + (3.0, 0.0, 1.0)) - walk, axis=-1).mean() < 0.01  # begins at the origin
+    trembling = walk + np.random.default_rng(0).normal(scale=0.02, size=walk.shape)
+    assert np.abs(np.diff(shown(trembling), 2, axis=0)).mean() < np.abs(np.diff(trembling, 2, axis=0)).mean() / 2
+    np.testing.assert_allclose(shown(walk[:1] + glide, types.SimpleNamespace(roles={})), walk[:1] + glide, atol=1e-6)
+    np.testing.assert_allclose(shown(walk[:1] + glide), np.repeat(walk[:1], 40, axis=0), atol=1e-6)
 
 
 @pytest.mark.slow
@@ -231,9 +233,8 @@ def test_redundant_features_stand_beside_positions_and_are_not_motion(folder, da
     # A step is that to the next frame's position.
     step = trained.codec.redundancy.restore(states[..., 3:])[..., :3]
     np.testing.assert_allclose(step[: data.start[1] - 1], np.diff(data.clip(0), axis=0), atol=1e-5)
-    made = captioned_motion.draw_motions(
-        trained, np.zeros((2, 8), np.float32), [24, 40], jax.random.key(0), num_steps=2
-    )
+    told = trained, np.zeros((2, 8), np.float32), [24, 40], jax.random.key(0)
+    made = captioned_motion.draw_motions(*told, num_steps=2)
     assert made.shape == (2, 40, 23, 3) and np.isfinite(made).all() and not made[0, 24:].any()
     seen = np.arange(2 * 4 * 23 * 13, dtype=np.float32).reshape(2, 4, 23, 13)
     np.testing.assert_array_equal(trained.codec.decode(seen, np.ones((2, 4), bool)), seen[..., :3])
@@ -258,9 +259,8 @@ def test_a_model_of_meshes_makes_vertices_and_the_joints_of_them(folder, data, t
     made = codec.decode_vertices(one[None])
     assert made.shape == (1, 64, count, 3)
     np.testing.assert_allclose(codec.decode(one[None], np.ones((1, 64), bool)), mesh.joints(made), atol=1e-5)
-    draw = lambda **how: captioned_motion.draw_motions(
-        trained, np.zeros((2, 8), np.float32), [24, 40], jax.random.key(0), num_steps=2, **how
-    )
+    told = trained, np.zeros((2, 8), np.float32), [24, 40], jax.random.key(0)
+    draw = lambda **how: captioned_motion.draw_motions(*told, num_steps=2, **how)
     joints, meshes = draw(), draw(mesh=True)
     assert meshes.shape == (2, 40, count, 3) and not meshes[0, 24:].any()
     np.testing.assert_allclose(mesh.joints(meshes), joints, atol=1e-4)

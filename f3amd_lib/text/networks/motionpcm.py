@@ -276,8 +276,7 @@ class LatentDenoiser(nnx.Module):
         if guidance is not None:
             width, scaled = config.guidance_features, GUIDANCE_SCALE * jnp.asarray(guidance)
             time = time + self.guidance(waves(scaled, width, width / 2 - 1, sine_first=True))
-        time = self.time_second(jax.nn.silu(self.time_first(time)))
-        time = jnp.broadcast_to(time, context.shape)
+        time = jnp.broadcast_to(self.time_second(jax.nn.silu(self.time_first(time))), context.shape)
         z = jnp.concatenate([self.latent(state), time[:, None], context[:, None]], axis=1)
         return z + self.positions[...][: z.shape[1]]
 
@@ -302,8 +301,7 @@ class LatentDenoiser(nnx.Module):
 
     def features(self, state, time, context) -> list[jax.Array]:
         """Return what each block makes of the latent's tokens, [B, window, D] each: what a discriminator reads."""
-        outputs = self.body.outputs(self._tokens(state, time, context, None))
-        return [z[:, : self.config.window] for z in outputs]
+        return [z[:, : self.config.window] for z in self.body.outputs(self._tokens(state, time, context, None))]
 
 
 def student_config(teacher: LatentDenoiserConfig) -> LatentDenoiserConfig:
