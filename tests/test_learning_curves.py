@@ -1,12 +1,10 @@
-"""Presets trained in legs by one command, and the power law through a learning curve."""
+"""Presets trained in legs by one command."""
 
 import dataclasses
 
 import jax
-import numpy as np
 import pytest
 from builders import HISTORY, WINDOW, packed_from, refused, wandering_motion
-from f3amd_notebooks.power_law import power_law
 
 from f3amd_companion.__main__ import main
 from f3amd_companion.measuring import measure
@@ -24,36 +22,6 @@ from f3amd_lib.training.recipe import profile_recipe
 def prepared():
     clips = [(wandering_motion(60, seed), seed % 2, split) for seed, split in ((0, 0), (1, 1))]
     return PreparedData(packed_from(clips), WINDOW, HISTORY)
-
-
-def test_a_power_law_is_found_and_followed():
-    windows = np.array([2e5, 4e5, 8e5, 1.6e6])
-    found = power_law(windows, 3.0 * windows**-0.25, [1e6, 2e8])
-    assert found["exponent"].tolist() == pytest.approx([-0.25, -0.25])
-    assert found["value"].tolist() == pytest.approx([3.0 * 1e6**-0.25, 3.0 * 2e8**-0.25])
-    assert found["low"].tolist() == pytest.approx(found["high"].tolist())  # no scatter, no doubt
-
-
-def test_the_interval_of_a_power_law_holds_the_truth_as_often_as_it_says():
-    windows, reach = 2e5 * 2.0 ** np.arange(6), 2e8
-    noise = np.random.default_rng(3).normal(scale=0.1, size=(400, 6))
-    found = [power_law(windows, 3.0 * windows**-0.25 * np.exp(one), [reach]).iloc[0] for one in noise]
-    held = np.mean([row["low"] < 3.0 * reach**-0.25 < row["high"] for row in found])
-    assert 0.92 < held < 0.98
-    near, far = power_law(windows, np.exp(noise[0]), [1e6, reach]).eval("high / low")
-    assert far > 1.5 * near  # doubt grows with the way
-
-
-@pytest.mark.parametrize(
-    "windows, values, reach, message",
-    [
-        ([1, 2], [1, 2], [3], "needs 3 points"),
-        ([1, 2, 3], [1, 0, 2], [3], "positive, finite"),
-        ([1, 2, 3], [1, 2, 3], [-1], "positive, finite"),
-    ],
-)
-def test_what_has_no_power_law_is_refused(windows, values, reach, message):
-    refused(message, power_law, windows, values, reach)
 
 
 def test_unknown_names_end_with_status_2(capsys):

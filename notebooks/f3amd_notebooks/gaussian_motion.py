@@ -34,17 +34,17 @@ class GaussianMotion:
         """Return the Gaussian of rows [M, N] with so many directions."""
         mean = rows.mean(axis=0)
         _, sizes, directions = np.linalg.svd(rows - mean, full_matrices=False)
-        rest = (sizes[kept:] ** 2).sum() / rows.size
+        rest = (sizes[kept:] ** 2).sum() / (len(rows) * (rows.shape[1] - kept))
         return cls(mean, directions[:kept].T, sizes[:kept] ** 2 / len(rows), float(rest))
 
-    def given(self, where, values, slack: float, rest: float = 1e-4) -> GaussianMotion:
+    def given(self, where, values, slack: float) -> GaussianMotion:
         """Return the Gaussian of rows whose numbers `where` have these values, but for a variance of `slack`."""
         seen = self.directions[where]
         spread = seen * self.variances
         gain = spread.T @ np.linalg.inv(spread @ seen.T + slack * np.eye(len(seen)))
         mean = self.mean + self.directions @ (gain @ (values - self.mean[where]))
         variances, turned = np.linalg.eigh(np.diag(self.variances) - gain @ spread)
-        return GaussianMotion(mean, self.directions @ turned, np.maximum(variances, 1e-9), rest)
+        return GaussianMotion(mean, self.directions @ turned, np.maximum(variances, 1e-9), self.rest)
 
     def draw(self, generator: np.random.Generator) -> np.ndarray:
         """Return one row [N], without the little of everything else."""

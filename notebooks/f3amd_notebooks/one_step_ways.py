@@ -160,5 +160,5 @@ def ways_table(
     for way, (models, steps) in ways.items():
         for number, model in enumerate(models):
             paths = sample_paths(model, diffusion, steps, side, jax.random.key(seed + number))
-            rows.append({"way": way, "steps": steps, "seed": number, **end_figures(model.data, paths)})
+            rows.append({"way": way, "steps": steps, "seed": seed + number, **end_figures(model.data, paths)})
     return pd.DataFrame(rows)

@@ -205,8 +205,8 @@ def side_by_side(ours: pd.DataFrame, paper: pd.DataFrame | None = None) -> pd.Da
 # ------------------------------------------------------------------------------ what we ask of our own models' motion
 #
 # Bars are ours, not the paper's: real motion of the same protocol is the measure. They stand in `quality_bars.csv`,
-# where `compared` is written in the figures of `made` motion, of `real` motion, the least distance to a bad generator
-# (`gap`) and the `accuracy` of the classifier.
+# where `compared` is written in the figures of `made` motion, of `real` motion, how far the nearest bad
+# generator is from real (`gap`) and the `accuracy` of the classifier.
 
 BAR_MODELS = ("F3AMD-FNO-96", "F3AMD-FNO-96-steady")
 """Models that are asked; the bar on noise is the second's."""
@@ -238,7 +238,7 @@ def quality_bars(quality: pd.DataFrame, classifier_accuracy: float) -> pd.DataFr
         real, broken = column[0, "real"], column[0].drop(index="real")
         for model in BAR_MODELS:
             made = column.get((1, model), np.nan)
-            figures = fixed | {"made": made, "real": real, "gap": (made - broken).abs().min()}
+            figures = fixed | {"made": made, "real": real, "gap": (broken - real).abs().min()}
             found[model] = pd.eval(bar.compared, local_dict=figures)
         met = [name for name, one in found.items() if pd.eval(f"one {bar.sign} {bar.limit}", local_dict={"one": one})]
         answer = "both" if len(met) == len(found) else ", ".join(met) or "neither"

@@ -10,6 +10,7 @@ from f3amd_lib.measures.real_clips import STANDING, motion_figures, own_path, si
 from f3amd_lib.measures.registry import METRICS
 from f3amd_lib.measures.walking import CHECKS, walking_figures
 from f3amd_lib.motion.root_paths import RootPath
+from f3amd_lib.motion.rotations import wrap_angle
 from f3amd_lib.motion.skeleton import Motion
 from f3amd_lib.rollout.blending import blend_rollout
 from f3amd_lib.rollout.generated import Rollout
@@ -166,9 +167,11 @@ def path_statistics(paths: Iterable[RootPath]) -> dict:
         span = round(path.fps)
         legs = path.position[span:] - path.position[:-span]
         moved = np.linalg.norm(legs, axis=-1) > STANDING
-        heading = np.rad2deg(np.unwrap(np.arctan2(legs[:, 0], legs[:, 1])))
-        turns.append(np.abs(heading[span:] - heading[:-span])[moved[span:] & moved[:-span]])
-    sideways = np.average(shares, weights=[len(speed) for speed in speeds])
+        heading = np.arctan2(legs[:, 0], legs[:, 1])
+        turned = np.rad2deg(np.abs(wrap_angle(heading[span:] - heading[:-span])))
+        turns.append(turned[moved[span:] & moved[:-span]])
+    weights = [np.sum(speed > STANDING) for speed in speeds]
+    sideways = np.average(shares, weights=weights) if any(weights) else np.nan
     speeds, turns = np.concatenate(speeds), np.concatenate(turns)
     moving = speeds[speeds > STANDING]
     figures = {"speed_m_s": moving.mean(), "speed_p5": np.percentile(moving, 5), "speed_p95": np.percentile(moving, 95)}

@@ -143,7 +143,8 @@ def digits() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Draw the ten digits in the fonts that come with matplotlib, shifted and turned, as images of 8 x 8.
 
     Returns:
-      Images [N, 64] around 0 of deviation about 1 and their digits [N], then those of fonts that the first do not have.
+      Images [N, 64], roughly centred and of deviation about 1, and their digits [N], then those of fonts that the
+      first do not have.
     """
     folder = Path(matplotlib.get_data_path(), "fonts/ttf")
     names = (

@@ -48,7 +48,7 @@ def repair(answer, rng: np.random.Generator) -> Verdict:
     table = pd.DataFrame(rows)
     left = table[[f"left at {level:g}" for level in levels]]
     worst, kinds, sentence = left.max(), left.max(axis=1), None
-    if (left > 0.5).any(axis=None):
+    if (left > 0.6).any(axis=None):
         low, middle, high = worst.iloc[:2].max(), worst.iloc[2], worst.iloc[3:].max()
         case = table.loc[kinds.idxmax()]
         name = f"the {case['fault']} denoiser of {case['data']} data"
