@@ -33,7 +33,7 @@ from tyro.conf import Positional, UseAppendAction
 
 from f3amd_lib import __version__
 from f3amd_lib.ground import log
-from f3amd_lib.ground.files import locked, write_whole
+from f3amd_lib.ground.files import check_own_folder, locked, write_whole
 from f3amd_lib.ground.names import check_known, checked_seed, checked_value
 from f3amd_lib.ground.profiles import load_profile, results_dir, runs_dir
 
@@ -282,7 +282,7 @@ def dataset(
       out: folder to write to; must be empty or new.
     """
     terminal.check_there(captions, source)
-    crowds.check_own_folder(out)
+    check_own_folder(out)
     terminal.check_writable(out)
     opened = sources.open_dataset(data, path=source, **people.asked())
     written = captioned_folder.captioned_motions(opened, captioned_folder.read_caption_table(captions), fps=fps)
@@ -547,7 +547,7 @@ def crowd(
     formats, motions = _motion_formats(format) if format else [], out.with_name(f"{out.name}_motions")
     num_frames = _num_frames(seconds)
     terminal.check_free([*drawn, *([motions] if formats else [])], model.overwrite)
-    crowds.check_own_folder(out, "crowd.json")
+    check_own_folder(out, "crowd.json")
     terminal.check_writable(out)
     named = [model.style(one) for one in style] or None
     log.info("animating    %d characters, %.1f seconds each", characters, num_frames / 30)

@@ -33,7 +33,7 @@ from tqdm import tqdm
 
 from f3amd_companion.serving.crowd_planning import FPS, MIN_DISTANCE, keep_apart
 from f3amd_lib.data.features import motion_from_frames, split_frames
-from f3amd_lib.ground.files import locked, write_whole
+from f3amd_lib.ground.files import check_own_folder, locked, write_whole
 from f3amd_lib.ground.names import checked_seed
 from f3amd_lib.ground.trees import errors_name, weights_digest
 from f3amd_lib.motion.root_paths import NAMES, RootPath, named_path
@@ -354,13 +354,6 @@ def _read_settings(folder: Path) -> dict:
 def _write_settings(folder: Path, settings: dict, finished: int) -> None:
     text = json.dumps(settings | {"num_finished": finished}, indent=1, ensure_ascii=False)
     write_whole(folder / _SETTINGS, text + "\n")
-
-
-def check_own_folder(folder, mark: str = "") -> None:
-    """Raise ValueError if a folder holds something, hidden files apart, unless the file `mark` says that it is ours."""
-    folder = Path(folder)
-    if not (mark and (folder / mark).is_file()) and (folder.is_file() or any(folder.glob("[!.]*"))):
-        raise ValueError(f"{folder}: holds other files; choose an empty folder")
 
 
 def _num_finished(out: Path, settings: dict, overwrite: bool) -> int:

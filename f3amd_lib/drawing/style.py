@@ -129,7 +129,7 @@ def show_figure(figure: Figure, *, dpi: int = 100, colors: int | None = None):
     return Shown(data=_png(figure, dpi) if colors is None else _few_colors(_png(figure, dpi), colors))
 
 
-def keep_figure(figure: Figure, results, name: str, colors: int = 64, data: str = ""):
+def keep_figure(figure: Figure, results, name: str, colors: int = 48, data: str = ""):
     """Save a figure as `<results>/figures/<name>.png` and return a light copy for the notebook.
 
     Args:
@@ -155,7 +155,7 @@ def keep_figure(figure: Figure, results, name: str, colors: int = 64, data: str 
 def _few_colors(png: bytes, colors: int, dpi: int | None = None) -> bytes:
     whole, small = Image.open(io.BytesIO(png)), io.BytesIO()
     scale = dpi / whole.info["dpi"][0] if dpi else 1
-    whole = whole.convert("RGB").resize([round(scale * side) for side in whole.size], Image.Resampling.LANCZOS)
+    whole = whole.convert("RGB").resize([round(scale * side) for side in whole.size], Image.Resampling.BOX)
     few = whole.quantize(colors, Image.Quantize.MAXCOVERAGE, kmeans=1, dither=Image.Dither.NONE)
     few.save(small, "png", optimize=True, dpi=[scale * dots for dots in whole.info["dpi"]])
     return small.getvalue()

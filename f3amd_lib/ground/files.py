@@ -106,6 +106,12 @@ def whole_folder(path) -> Iterator[Path]:
         yield temporary
 
 
+def check_own_folder(folder: Path, mark: str = "") -> None:
+    """Raise ValueError if a folder holds something, hidden files apart, unless the file `mark` says that it is ours."""
+    if not (mark and (folder / mark).is_file()) and (folder.is_file() or any(folder.glob("[!.]*"))):
+        raise ValueError(f"{folder}: holds other files; choose an empty folder")
+
+
 @contextlib.contextmanager
 def locked(path, doing: str, *, wait: bool = False) -> Iterator[None]:
     """Hold a lock file while the block runs, so that no second process does the same work there.

@@ -236,8 +236,7 @@ def diversity_variance(positions) -> float:
     positions = np.asarray(positions, dtype=np.float64)
     if positions.ndim < 4 or positions.shape[-4] < 2 or not np.all(np.isfinite(positions)):
         raise ValueError(f"diversity needs finite [..., num_seeds, T, J, 3] of at least 2 seeds, got {positions.shape}")
-    relative = positions - positions[..., :1, :]
-    return float(relative.var(axis=-4, ddof=1).sum(axis=-1).mean())
+    return float((positions - positions[..., :1, :]).var(axis=-4, ddof=1).sum(axis=-1).mean())
 
 
 def diversity(positions) -> float:
@@ -349,8 +348,6 @@ def settling_curve(features, reference, sizes: Sequence[int], *, repeats: int = 
         for repeat in range(repeats):
             generator = np.random.default_rng([seed, size, repeat])
             drawn = [draw_per_style(side, size, generator) for side in sides]
-            rows += [
-                {"metric": metric, "windows": len(drawn[0]), "value": distance(*drawn)}
-                for metric, distance in DISTANCES.items()
-            ]
+            figures = {metric: distance(*drawn) for metric, distance in DISTANCES.items()}
+            rows += [{"metric": name, "windows": len(drawn[0]), "value": value} for name, value in figures.items()]
     return intervals_over_repeats(pd.DataFrame(rows), ("metric", "windows"))
