@@ -53,7 +53,7 @@ def _with_interval(row) -> str:
 
 
 def judge_note(name: str) -> str:
-    """Say which other tables of text to motion were looked at by another judge than a committed one, "" if none was.
+    """Say which judges measured the committed tables of text to motion, "" if it was one.
 
     Judges of one recipe differ from training to training, so that their figures are on scales of their own.
     """
@@ -61,13 +61,15 @@ def judge_note(name: str) -> str:
     names = [other for paper in papers for other in load_paper_file("experiments", paper) if other != "settings"]
     tables = {other: committed_table("bandai", other) for other in ("text_judge", *names)}
     judges = {other: found[1]["judge_weights"] for other, found in tables.items() if found}
-    others = [f"`{other}`" for other, judge in judges.items() if judge != judges[name]]
-    if not others:
+    named: dict[str, list[str]] = {}
+    for other, judge in judges.items():
+        named.setdefault(judge, []).append(f"`{other}`")
+    if len(named) < 2:
         return ""
-    return (
-        f"The judge of `{name}` (weights {judges[name]}) is another than that of {', '.join(others)}: it was "
-        "trained anew. Compare FID, R-precision and their like within one judge's tables alone."
-    )
+    own = f"The judge of `{name}` has weights {judges[name]}. "
+    others = "; ".join(f"{judge} of {', '.join(tables)}" for judge, tables in named.items() if judge != judges[name])
+    compare = "Compare FID, R-precision and their like within one judge's tables alone."
+    return f"{own}Others were trained at other times: {others}. {compare}"
 
 
 WHOSE = {

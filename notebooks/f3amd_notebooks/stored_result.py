@@ -1,5 +1,6 @@
 """What earlier runs left, as a notebook shows it: tables, a picture, and how long each notebook ran."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pandas as pd
@@ -12,13 +13,13 @@ from f3amd_lib.papers.printed import SCHEMAS
 from IPython.display import Image
 
 
-def stored_result(dataset: str, name: str) -> str:
-    """Return a table that `make figures` left as Markdown, and a line on its origin; or that there is none yet."""
+def stored_result(dataset: str, name: str, summary: Callable = lambda frame: frame) -> str:
+    """Return a table that `make figures` left, or its summary, as Markdown with its origin; or that none is there."""
     if (found := committed_table(dataset, name, kind="tables")) is None:
         return f"No stored `{name}` of `laptop` on `{dataset}` yet: `make figures` makes it."
     frame, record = found
     where = f"profile {record['profile']}, data {record['dataset']}, {machine_of(record)}"
-    return f"Stored result: `{name}`, {where}\n\n{markdown_table(frame, digits=2)}"
+    return f"Stored result: `{name}`, {where}\n\n{markdown_table(summary(frame), digits=2)}"
 
 
 def measured_table(dataset: str, name: str, measurement: str) -> tuple[pd.DataFrame | None, str]:
