@@ -79,6 +79,12 @@ def _given(**options) -> dict:
     return {name: value for name, value in options.items() if value is not None}
 
 
+def _only_with(needed: str, missing: bool, **options) -> None:
+    """Raise ValueError for given options that would do nothing, as what they need is missing."""
+    if missing and (idle := [f"--{name.replace('_', '-')}" for name, given in options.items() if given]):
+        raise ValueError(f"{', '.join(idle)}: only with {needed}")
+
+
 def _stop_at(minutes: float | None) -> float | None:
     """Return when so many minutes from now are over (`time.monotonic`)."""
     return None if minutes is None else time.monotonic() + 60.0 * minutes
@@ -170,6 +176,8 @@ class Data:
     def open(self, **overrides):
         """Return the data set, prepared, and the profile as `numbers` does, with this window."""
         profile = self.numbers(**overrides, window=self.window)
+        _only_with("--data bandai, 100style or folder", self.data == "synthetic", source=self.source)
+        _only_with("--data folder", self.data != "folder", **vars(self.people))
         terminal.check_there(self.source)
         return pipeline.prepare(profile, path=self.source, **self.people.asked()), profile
 
@@ -282,6 +290,8 @@ def dataset(
       out: folder to write to; must be empty or new.
     """
     terminal.check_there(captions, source)
+    if not 1.0 <= fps <= 1000.0:  # also catches NaN
+        raise ValueError(f"--fps must be between 1 and 1000, got {fps}")
     check_own_folder(out)
     terminal.check_writable(out)
     opened = sources.open_dataset(data, path=source, **people.asked())
@@ -411,6 +421,8 @@ def rollout(
     style, seed, drawn, history = model.style(style), checked_seed(seed), path.lower().endswith(".csv"), None
     targets = _targets(out, f"{style}_{Path(path).stem}_seed{seed}", format, model.overwrite)
     terminal.check_there(start, path if drawn else None)
+    _only_with("--start", start is None, **vars(person))
+    _only_with("a named path", drawn, seconds=seconds != 20.0, speed=speed != 1.2)
     log.info("animating    %s along %s", style, path)
     how = {"speed": speed, "seed": seed}
     line = root_paths.read_path_csv(path) if drawn else root_paths.named_path(path, _num_frames(seconds), **how)
@@ -485,6 +497,7 @@ def text(
       out: folder to write to.
     """
     captions, seed = [caption, *then], checked_seed(seed)
+    _only_with("--control", control is None, joint=joint != "pelvis")
     if then and control:
         raise ValueError("--control is for one caption, not for a stream: leave out --then or --control")
     name = f"{re.sub('[^a-z0-9]+', '-', ' then '.join(captions).lower()).strip('-')[:80]}_seed{seed}"
@@ -495,7 +508,9 @@ def text(
         latent = model and text_models.is_latent_preset(text_models.named_model(model, steps))
         weights = text_models.find_text_model(data, preset, control=bool(control and not latent), num_steps=steps)
     trained = _say_model(text_models.load_text_model(weights))
-    encoder = text_encoders.load_text_encoder(trained.text_encoder.split("-")[0], text_weights)
+    encoder = trained.text_encoder.split("-")[0]
+    _only_with("a model of CLIP or Sentence-T5", encoder == "wordllama", text_weights=text_weights)
+    encoder = text_encoders.load_text_encoder(encoder, text_weights)
     how = {"seconds": seconds, "seed": seed, "guidance": guidance, "num_steps": steps, "any_words": any_words}
     made = captioned_motion.animate(trained, encoder, captions, control=control, joint=joint, **how)
     far = lambda metres: f"{100 * metres.mean():.1f} cm on average, {100 * metres.max():.1f} cm at most"
@@ -543,6 +558,7 @@ def crowd(
     """
     if plan is not None and len(plan) > 1:
         raise ValueError(f"--plan takes one number of metres, got {len(plan)}")
+    out = out.resolve()
     drawn = [out.with_name(f"{out.name}{ending}") for ending in (".png", ".html")] if pictures else []
     formats, motions = _motion_formats(format) if format else [], out.with_name(f"{out.name}_motions")
     num_frames = _num_frames(seconds)
@@ -582,6 +598,7 @@ def export(
       out: folder to write to.
     """
     terminal.check_writable(out)
+    _only_with("--target onnx", "onnx" not in target, stored=stored != "float32")
     how = {"num_steps": model.steps, "overwrite": model.overwrite}
     if "onnx" in target:
         if len(target) > 1 or model.sampler:
@@ -657,6 +674,7 @@ def measure(
       packed: of text to motion: all clips of bandai as their packed cache file, instead of their source.
     """
     names = names or (papers.load_paper_file("experiments", "acmdm")["settings"][plan]["order"] if plan else ())
+    terminal.check_there(published, packed)
     for name in names:
         check_known(name, [*measuring.MEASUREMENTS, *text_tables.TEXT_MEASUREMENTS], "measurement")
     if of_text := [name for name in names if name in text_tables.TEXT_MEASUREMENTS]:
@@ -881,7 +899,7 @@ def reproduce(
         raise ValueError("--evaluator is needed: the folder of the published one, see docs/reproduce.md")
     folder = out or runs_dir("folder", "gpu") / "reproduced" / paper
     given = paper_tables.Sources(data, evaluator, weights, text_encoder, text_weights)
-    with locked(folder / f".{table}.lock", f"reproducing table {table}"):
+    with locked(folder / f".{Path(table).name}.lock", f"reproducing table {table}"):
         how = {"out": folder, "repeats": repeats, "seed": seed, "stop_at": _stop_at(minutes)}
         path = paper_tables.reproduce_table(paper, table, given, **how)
     return _say_reproduced(path and [path])
@@ -907,6 +925,7 @@ COMMANDS = (
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; errors that the user can fix end with one line and status 2."""
     logging.basicConfig(format="%(message)s", stream=sys.stdout)  # of others' logs, warnings
+    logging.Handler.handleError = terminal.raise_again
     terminal.set_environment()
     given = sys.argv[1:] if argv is None else list(argv)
     words = [word for word in given if word != "--quiet"]
@@ -932,7 +951,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             args=words,
             config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
         )
-    except (ValueError, OSError, ArithmeticError, ImportError) as error:
+    except BrokenPipeError:  # `f3amd styles | head`: what is left has no reader
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
+    except (ValueError, OSError, ArithmeticError, ImportError, MemoryError, RuntimeError) as error:
         print(f"f3amd {name}: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:

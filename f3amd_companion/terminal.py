@@ -38,7 +38,7 @@ def check_there(*files: Path | str | None) -> None:
 def check_writable(*targets: Path) -> None:
     """Raise ValueError if one of the files or folders cannot be created."""
     for target in targets:
-        folder = next(folder for folder in target.absolute().parents if folder.exists())
+        folder = next(folder for folder in (target.absolute(), *target.absolute().parents) if folder.is_dir())
         try:
             with tempfile.TemporaryFile(dir=folder):
                 pass
@@ -57,10 +57,15 @@ def check_free(targets: Sequence[Path], overwrite: bool) -> None:
 def show_plainly(quiet: bool) -> None:
     """Show progress as plain lines, one every ten seconds, where there is no terminal; none if quiet."""
     log.setLevel(logging.WARNING if quiet else logging.INFO)
-    if quiet or not sys.stderr.isatty():
+    if quiet or sys.stderr is None or not sys.stderr.isatty():
         from tqdm import tqdm
 
         tqdm.__init__ = functools.partialmethod(getattr(tqdm.__init__, "func", tqdm.__init__), file=Lines(quiet))
+
+
+def raise_again(handler: logging.Handler, record: logging.LogRecord) -> None:
+    """Raise what went wrong in writing a line, such as a full disk, instead of printing a traceback."""
+    raise
 
 
 class Lines:

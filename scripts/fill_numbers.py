@@ -8,6 +8,7 @@ A number has its name behind it, in a comment that no reader sees: `takes 12<!--
 
 from __future__ import annotations
 
+import argparse
 import re
 import sys
 from collections.abc import Callable
@@ -89,9 +90,8 @@ def _quality() -> dict[str, str]:
         found = {f"{way}_{name}": value.get((*row, metric)) for way, row in ways.items()}
         told |= {key: f"{figure:.{digits}f}" for key, figure in found.items() if figure is not None}
     real = quality.query("model == 'real' and metric == 'contact_share'")["value"].iloc[0]
-    told |= {
-        f"{way}_contact": f"{100 * value[(*ways[way], 'contact_share')]:.0f}" for way in ("steady", "steady_student")
-    }
+    for way in ("camdm", "camdm_student1", "steady", "steady_student"):
+        told[f"{way}_contact"] = f"{100 * value[(*ways[way], 'contact_share')]:.0f}"
     return told | {"real_contact": f"{100 * real:.0f}"}
 
 
@@ -146,16 +146,19 @@ def filled(page: str, known: dict[str, str], where: str) -> str:
 
 
 def main(words: list[str], say: Callable = print) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--check", action="store_true")
+    check = parser.parse_args(words).check
     known, changed = numbers(), []
     for path in PAGES:
         before = path.read_text(encoding="utf-8")
         after = filled(before, known, path.name)
         if after != before:
             changed.append(path.name)
-            if "--check" not in words:
+            if not check:
                 path.write_text(after, encoding="utf-8")
     say(f"changed: {', '.join(changed) or 'nothing'}")
-    return int(bool(changed) and "--check" in words)
+    return int(bool(changed) and check)
 
 
 if __name__ == "__main__":

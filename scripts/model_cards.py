@@ -7,6 +7,7 @@ Everything on a card is read from the weights file and from committed results; n
 
 from __future__ import annotations
 
+import argparse
 import hashlib
 import re
 import sys
@@ -135,7 +136,8 @@ def _training(path: Path, trained, recipe: Mapping, paper: str = "") -> dict:
     # A model may be trained in several legs, of which the recipe is the last's.
     seen, legs = record.get(examples, recipe["num_steps"] * recipe["batch_size"]), record.get("schedule_note")
     loss = read_table(path.with_name(f"{path.stem}.history.csv"))[0]["held_out_loss"].dropna().iloc[-1]
-    fields = {"recipe": recipe, "loss": loss, "seen": seen, "legs": f" ({legs})" if legs else ""}
+    fields = {"recipe": recipe, "loss": loss, "seen": seen}
+    fields |= {"legs": f" ({legs})" if legs else "", "last": " in the last part" if legs else ""}
     fields |= {"steps": seen // recipe["batch_size"], "passes": seen / record[data]}
     if paper:
         about = load_paper_file("paper", paper)["training"]
@@ -260,6 +262,7 @@ def write_cards(folder: Path = PRETRAINED_DIR) -> list[Path]:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     for card in write_cards():
         print(card)
     page = ROOT / "docs" / "results.md"

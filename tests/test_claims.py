@@ -154,16 +154,6 @@ def quality(model, *, steps=8, window=32, harm=1.0, half=0.01, **values):
     return rows
 
 
-def epochs(fno, camdm):
-    """Curves over 100 epochs that come close to their best at a given epoch."""
-    curves = product(((FNO, fno), (CAMDM, camdm)), (("held_out_loss", 1.0, 2.0), ("style_coverage", 90.0, 40.0)))
-    return [
-        {"model": model, "epoch": epoch, "metric": metric, "value": best if epoch >= reached else worse}
-        for (model, reached), (metric, best, worse) in curves
-        for epoch in range(1, 101)
-    ]
-
-
 def rounds(growth, **others):
     """Figures by round that grow by a share over a rollout; some metrics by another one."""
     wobble = np.random.default_rng(0).normal(1.0, 0.01, 80)
@@ -244,7 +234,7 @@ def world(true):
             row | {"peak_memory_mib": memory.get(row["model"], 1000.0)}
             for row in table("model window_frames value", train, device="GPU", batch_size=512, unit="s")
         ],
-        "quality_by_epoch": epochs(*choose((30, 40), (40, 30))),
+        "convergence": table("model value", [(FNO, choose(30, 40)), (CAMDM, choose(40, 30))], metric="FID"),
         "foot_spectrum": [
             row | about(row["value"], 0.05)
             for row in table("model band metric value", bands, window_frames=32, steps=8)

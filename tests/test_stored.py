@@ -57,8 +57,8 @@ REFERENCE = {"weights_digests": {"A": ["aa"], "real": ["cc"]}, "classifier_weigh
         ("one_step", {"weights_digests": {"A, distilled": ["aa"]}, "classifier_weights": "cc"}, ""),
         ("one_step", {"weights_digests": {"A, distilled": ["ab"]}}, OTHER_A),
         ("quality_by_seed", {"weights_digests": {"A": ["aa"]}, "classifier_weights": "cc"}, ""),
-        ("quality_by_epoch", {"classifier_weights": "cd"}, "was seen through another style classifier (cd, now cc)"),
-        ("quality_by_epoch", {}, "was seen through another style classifier (None, now cc)"),
+        ("convergence", {"classifier_weights": "cd"}, "was seen through another style classifier (cd, now cc)"),
+        ("convergence", {}, "was seen through another style classifier (None, now cc)"),
         ("corruptions", {"classifier_weights": "cd"}, ""),  # about the distances, whichever classifier
         ("corruptions", {}, "does not say which style classifier it was seen through"),
         ("training_time", {}, ""),

@@ -19,7 +19,7 @@ from f3amd_lib.ground.names import asked_network, check_known, counted_cores, ne
 from f3amd_lib.ground.papers import load_paper_file, load_paper_table, paper_folders
 from f3amd_lib.ground.profiles import DATASETS, PROFILES
 from f3amd_lib.ground.records import folder_reason, read_table
-from f3amd_lib.measures.distributions import intervals_over_repeats, of_seeds
+from f3amd_lib.measures.distributions import intervals_over_repeats, mean_and_interval, of_seeds
 from f3amd_lib.measures.walking import CHECKS
 from f3amd_lib.networks import presets
 from f3amd_lib.papers.printed import PUBLISHED_CAMDM, SCHEMAS, printed_tables
@@ -134,36 +134,41 @@ def known(look: Callable, *arguments, **named):
 
 
 class Figure(NamedTuple):
-    """A number, the mean over seeds or the median of times, with its 95 % interval; all three equal for one repeat."""
+    """A number, the mean over seeds or the median of times, with its 95 % interval; all three equal for one repeat.
+
+    `trainings` has what each network of the mean shows, digest of its weights -> value, where that is on record.
+    """
 
     value: float
     low: float
     high: float
+    trainings: Mapping[str, float] | None = None
 
     @staticmethod
-    def of(value, low=np.nan, high=np.nan) -> Figure:
+    def of(value, low=np.nan, high=np.nan, trainings=None) -> Figure:
         """Make a figure; bounds that are NaN (a single repeat) become the value itself."""
-        return Figure(*(float(value if np.isnan(bound) else bound) for bound in (value, low, high)))
+        return Figure(*(float(value if np.isnan(bound) else bound) for bound in (value, low, high)), trainings)
 
     def map(self, function: Callable[[float], float]) -> Figure:
         """Return the figure under a rising function."""
-        return Figure(*map(function, self))
+        return Figure(*map(function, self[:3]))
 
 
 def _combine_logs(figures: Sequence[Figure], weights) -> Figure:
     """Return exp of the weighted sum of logarithms of positive figures, with its interval."""
     weights = np.asarray(weights, dtype=np.float64)
     with np.errstate(divide="ignore"):
-        value, low, high = np.log(np.maximum(np.transpose(figures), 0.0))
+        value, low, high = np.log(np.maximum(np.transpose([figure[:3] for figure in figures]), 0.0))
     sides = np.where(weights > 0, [value - low, high - value], [high - value, value - low])
     down, up = np.sqrt(np.sum((weights * sides) ** 2, axis=1))
     return Figure(*(float(np.exp(weights @ value + reach)) for reach in (0.0, -down, up)))
 
 
 def ratio(numerator: Figure, denominator: Figure) -> Figure:
-    """Return the quotient of two figures with its interval, both being independent.
+    """Return the quotient of two figures with its interval.
 
-    The interval is recovered from those of the two logarithms: distances from value to bound add
+    Figures of the same networks are paired: the interval is Student's, of their logarithms. Others are independent,
+    and the interval is recovered from those of the two logarithms: distances from value to bound add
     up in squares. The quotient is infinite for a denominator of 0, and 1 for 0 / 0.
 
     Raises:
@@ -174,6 +179,10 @@ def ratio(numerator: Figure, denominator: Figure) -> Figure:
     if min(numerator.value, denominator.value) < 0:
         raise ValueError(f"a ratio of {numerator.value} and {denominator.value} means nothing")
     if numerator.value > 0 and denominator.value > 0:
+        above, below = (one.trainings or {} for one in (numerator, denominator))
+        if len(above) > 1 and above.keys() == below.keys() and min(*above.values(), *below.values()) > 0:
+            paired = mean_and_interval([np.log(above[one] / below[one]) for one in above])
+            return Figure(*(float(np.exp(paired[bound])) for bound in ("value", "low", "high")))
         return _combine_logs([numerator, denominator], [1.0, -1.0])
     # Logarithms have no say about 0: take the widest quotients that the bounds allow.
     divide = lambda a, b: a / b if b > 0 else (float("inf") if a > 0 else 1.0)
@@ -197,7 +206,9 @@ def power_law(x: Sequence[float], figures: Sequence[Figure]) -> Figure:
 # ------------------------------------------------------------------------------------------- tables
 
 
-OF_TRAINED_NETWORKS = ("quality", "quality_by_round", "foot_spectrum", "x0_by_sigma", "gradient_norm", "recipe_errors")
+OF_TRAINED_NETWORKS = (
+    "quality", "quality_by_round", "foot_spectrum", "x0_by_sigma", "gradient_norm", "recipe_errors", "convergence",
+)  # fmt: skip
 """Tables that say how well a network does: what is judged by them passes the gate (`ledger.gate`)."""
 
 OF_TIME = ("sampling_seconds",)
@@ -310,9 +321,8 @@ class Evidence:
         """
         found = self.rows(name, **row)
         if value in found and len(found := found[found[value].notna()]):
-            return Figure.of(
-                *(found[one].iat[0] for one in (("value", "low", "high") if value == "value" else (value,)))
-            )
+            wanted = ("value", "low", "high", "trainings") if value == "value" else (value,)
+            return Figure.of(*(found[one].iat[0] for one in wanted if one in found))
         what = "" if value == "value" else f"{value} of "
         raise NotMeasured(f"{self.called(name)} no {what}{_row_text(row)}")
 
@@ -392,8 +402,7 @@ def snapshot_evidence(root, dataset: str, profile: str) -> list[Evidence]:
 
     Returns:
       Evidence for each number of windows, means over seeds: `quality` of networks by the paper's text alone, and
-      `recipe_errors`, held-out joint errors of single windows by recipe.
-      Then evidence of `quality_by_epoch`: of each network the run with most snapshots. A queue that went on elsewhere
+      `recipe_errors`, held-out joint errors of single windows by recipe. A queue that went on elsewhere
       has rows of several style classifiers; how little most of them differ is in `records/classifiers.csv`.
     """
     path = Path(root) / dataset / profile / "records" / "campaign.csv"
@@ -417,17 +426,7 @@ def snapshot_evidence(root, dataset: str, profile: str) -> list[Evidence]:
         tables = {name: checked_table(name, one, where) for name, one in tables.items()}
         at = lambda share, windows=windows: by_length.get(share * windows)
         by_length[windows] = _evidence_of(tables, record, where, gap, at=at)
-    curves = checked_table("quality_by_epoch", _learning_curves(table), place)
-    return [*by_length.values(), _evidence_of({"quality_by_epoch": curves} if len(curves) else {}, record, place, gap)]
-
-
-def _learning_curves(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return, of rows of the long queue, those of each model's run with most snapshots, if it has two or more."""
-    rows = rows[rows["metric"].isin([*NINE_METRICS, "held_out_loss"]) & (rows["window_frames"] == 32)]
-    rows = rows[rows["steps"].isin([0, 8])].rename(columns={"epochs": "epoch"})  # the loss has no steps
-    lengths = rows.groupby(["model", "run"])["windows"].nunique()
-    longest = lengths[lengths > 1].sort_values().reset_index().drop_duplicates("model", keep="last")["run"]
-    return rows.loc[rows["run"].isin(longest), [*SCHEMAS["quality_by_epoch"], "value"]]
+    return [*by_length.values()]
 
 
 @functools.cache

@@ -24,7 +24,7 @@ ERRORS = ("held_out_loss", "text_FID")
 """Figures of a row of text to motion that must have; of other networks it is held-out error and FID."""
 
 MOST_TREMBLING = 1.5
-"""Of the acceleration of real clips that plausible motion of text has."""
+"""Times the acceleration of real clips, or as many times less, is plausible motion of text."""
 
 GATE_STEPS = 8
 """Denoising steps with which a network has to walk."""
@@ -53,7 +53,7 @@ def _plausible(evidence: Evidence, network: Network) -> bool:
     """Tell whether a network is on record as one whose motion could be real."""
     if network.table:
         trembling = known(evidence.figure, network.table, **dict(network.row), metric="acceleration_ratio")
-        return trembling is not None and trembling.value <= MOST_TREMBLING
+        return trembling is not None and 1.0 / MOST_TREMBLING <= trembling.value <= MOST_TREMBLING
     figure = lambda check, **row: known(evidence.figure, "walking", metric=check, window_frames=network.window, **row)
     pairs = {check: (figure(check, model=network.model, steps=GATE_STEPS), figure(check, model="real", steps=0))
              for check in CHECKS}  # fmt: skip

@@ -20,7 +20,7 @@ was known, and nothing else.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from itertools import combinations, pairwise, product
+from itertools import combinations, product
 
 import numpy as np
 import pandas as pd
@@ -63,12 +63,6 @@ ROUNDING = 0.05
 
 SAVING_SLACK = 0.5
 """Slack of a stated share of time saved, %: the paper rounds to whole percents."""
-
-CONVERGED = 0.05
-"""A metric has converged in the first epoch that comes this close to its best."""
-
-STILL_BETTER = 0.9
-"""If that epoch lies in the last tenth of a run, the run was too short to tell."""
 
 GRADED = 0.05
 """Least lead of one metric over another in the share of pairs that it puts in the right order."""
@@ -232,8 +226,12 @@ def ranked(evidence: Evidence, table: str, metric: str, rows, among=None, coordi
     A paper may have divided the first row's figure by coordinates instead of points, so many of each: where that
     decides, nothing can be told.
     """
-    worse = lambda first, second: ordered(_times_worse(metric, second, first))
-    judge = lambda figures: majority(worse(*pair) for pair in pairwise(figures))
+
+    def judge(figures: Sequence[Figure]) -> str:
+        """Compare all pairs. The best must be right; one other pair that is contradicted leaves "in part" at most."""
+        pairs = [ordered(_times_worse(metric, second, first)) for first, second in combinations(figures, 2)]
+        return FAILS if FAILS in pairs[: len(figures) - 1] else majority(pairs)
+
     return _counted(evidence, judge, ", ", table, metric, rows, among, coordinates)
 
 
@@ -287,11 +285,12 @@ def speedup(
 ) -> Finding:  # fmt: skip
     """Judge how many times as fast one model, or each of a family, is at some numbers of characters.
 
-    With the unit " %" it is the time saved. `some`: at those of them that were timed; `mean`: on average over these.
+    With the unit " %" it is the time saved. `some`: at those that were timed, at least half; `mean`: on average.
     """
     timed = lambda count: known(_gain, evidence, slow, fast, device, count)
-    # If none was timed, the reason is that of the first.
-    counts = (list(filter(timed, characters)) or characters[:1]) if some or mean else characters
+    counts = list(filter(timed, characters)) if some or mean else characters
+    if len(counts) < len(characters) * (0.5 if some else 1.0):
+        counts = characters  # the reason is that of the first gap
     models = _timed(evidence, fast, device, counts)
     figures = [_gain(evidence, slow, model, device, count) for model in models for count in counts]
     figures = [mean_figure(figures)] if mean else figures
@@ -358,29 +357,6 @@ def step_exponent(evidence: Evidence, model, device, characters, bounds=None) ->
     text = ", ".join(f"{figure_text(one)} at {count:,}" for one, count in zip(found, characters, strict=True))
     judged = found[0] if bounds else ratio(found[1].map(np.exp), found[0].map(np.exp))
     return _compared(judged, bounds), f"exponent {text}"
-
-
-def _converged_epoch(curve: pd.Series, model: str, metric: str) -> float:
-    """Return the first epoch of a curve that comes close to the best one; NotMeasured if it may yet get better."""
-    up = NINE_METRICS.get(metric, ("", "down"))[1] == "up"
-    close = curve >= curve.max() * (1.0 - CONVERGED) if up else curve <= curve.min() * (1.0 + CONVERGED)
-    reached, last = float(close.idxmax()), float(curve.index[-1])
-    if reached > STILL_BETTER * last:
-        raise NotMeasured(f"{metric} of {model} was still getting better at the last epoch, {last:.3g}")
-    return reached
-
-
-def convergence(evidence: Evidence, model, against) -> Finding:
-    """Judge, metric by metric, whether a model converges in no more epochs than another."""
-    names = [model["model"], against["model"]]
-    curves = {name: evidence.rows("quality_by_epoch", model=name).set_index("epoch").sort_index() for name in names}
-    own, other = curves.values()
-    if not (shared := [metric for metric in own["metric"].unique() if metric in set(other["metric"])]):
-        raise NotMeasured(f"quality_by_epoch.csv has no metric of both {' and '.join(names)}")
-    reached = lambda metric, name, curve: _converged_epoch(curve.loc[curve["metric"] == metric, "value"], name, metric)
-    epochs = {metric: [reached(metric, *each) for each in curves.items()] for metric in shared}
-    verdict = majority(HOLDS if own <= (1.0 + TOLERANCE) * other else FAILS for own, other in epochs.values())
-    return verdict, ", ".join(f"{name} {own:g} against {other:g}" for name, (own, other) in epochs.items())
 
 
 # ------------------------------------------------------------------------------------- of quality

@@ -40,17 +40,13 @@ def ve_is_vp(_) -> Finding:
     return _agreement(float(np.abs(carried - preserving).max()))
 
 
-def _euler(x, x0_hat, sigma, sigma_next):
-    return x + (sigma_next - sigma) * samplers.probability_flow_slope(x, x0_hat, sigma)
-
-
 def _rescaled(x, x0_hat, sigma, sigma_next):
     """Take the printed update between rescalings to and from the VP state."""
     alpha_bar, alpha_bar_next = map(schedules.alpha_bar_from_sigma, (sigma, sigma_next))
     return samplers.ddim_step_vp(np.sqrt(alpha_bar) * x, x0_hat, alpha_bar, alpha_bar_next) / np.sqrt(alpha_bar_next)
 
 
-_STEPS = {"Euler": _euler, "rescaled": _rescaled, "printed": samplers.ddim_step_literal}
+_STEPS = {"Euler": samplers.SAMPLERS["euler"].step, "rescaled": _rescaled, "printed": samplers.ddim_step_literal}
 
 
 def _walk(update: str, num_steps: int) -> np.ndarray:

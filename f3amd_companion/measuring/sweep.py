@@ -137,10 +137,8 @@ def plan(
     return list(dict.fromkeys(legs))  # of two measurements of a preset the training is one leg
 
 
-@functools.lru_cache(maxsize=1)
-def _opened(profile: Profile, source: str | None) -> PreparedData:
-    """Open the data once a process."""
-    return prepare(profile, path=source)
+_opened = functools.lru_cache(maxsize=1)(prepare)
+"""Opens the data once a process."""
 
 
 def run_leg(work: Work, leg: Leg, before: dict | None = None) -> dict:
@@ -159,7 +157,7 @@ def run_leg(work: Work, leg: Leg, before: dict | None = None) -> dict:
     alone = locked(place / ".lock", f"doing {leg.name}", wait=True)
     with _ALONE, alone, mock.patch.dict(os.environ, {RESULTS_DIR_VARIABLE: str(place)}):
         log.info("begun: %s", leg.name)
-        prepared, started = _opened(work.profile, work.source), time.perf_counter()
+        prepared, started = _opened(work.profile, path=work.source), time.perf_counter()
         if leg.measurement == TRAIN:
             *_, origin = obtain_model(prepared, work.profile, preset=leg.preset, progress=False)
             state, kept = origin.replace("trained now", "done"), model_files(work.profile, leg.preset).state

@@ -237,7 +237,7 @@ def autoregressive_rows(bench: Bench, trained: TextModel, row: Mapping, about: M
     def make(pooled, lengths, key):
         if begin is None:
             return draw(true, pooled, key)
-        return draw(draw_motions(first, pooled, count, jax.random.fold_in(key, 1), draw=begin), pooled, key)
+        return draw(draw_motions(first, pooled, count, jax.random.fold_in(key, 2**31 - 1), draw=begin), pooled, key)
 
     return bench.quality(make)
 
@@ -376,7 +376,7 @@ def sentence_seconds(bench: Bench, trained: LatentModel, draw: Callable) -> floa
     The median of 30, after one that compiles; all are as long as the model's longest clip.
     """
     told, mask = bench.captions(0)[0], frame_mask([trained.most_frames], trained.most_frames)
-    embed = lambda number: embed_captions([told[number % len(told)]], bench.encoder).pooled
+    embed = lambda number: bench.encoder([told[number % len(told)]]).pooled
     return median_seconds(lambda number: draw(embed(number), mask, jax.random.key(number)), 30)
 
 

@@ -180,9 +180,12 @@ def measure_synthesis_time(
       goes on where it was. None where `stop_at` came first.
 
     Raises:
-      ValueError: for an unknown suite.
+      ValueError: for an unknown suite, or a number of characters that none has.
     """
     suites = suites or DEFAULT_SUITES[profile.name]
+    counts = {candidates[0].characters for suite in suites for candidates in plan(suite).values()}
+    if never := {*(characters or counts)} - counts:
+        raise ValueError(f"no group of {min(never)} characters in {', '.join(suites)}: there are {sorted(counts)}")
     turns = {"fewest_rounds": 3, **_TURNS.get(profile.name, {})}
     record = _record(prepared, profile, "synthesis_time", turns=turns)
     keys = ["suite", *(field.name for field in dataclasses.fields(Candidate))]

@@ -34,7 +34,7 @@ from tqdm import tqdm
 from f3amd_companion.serving.crowd_planning import FPS, MIN_DISTANCE, keep_apart
 from f3amd_lib.data.features import motion_from_frames, split_frames
 from f3amd_lib.ground.files import check_own_folder, locked, write_whole
-from f3amd_lib.ground.names import checked_seed
+from f3amd_lib.ground.names import checked_seed, checked_value
 from f3amd_lib.ground.trees import errors_name, weights_digest
 from f3amd_lib.motion.root_paths import NAMES, RootPath, named_path
 from f3amd_lib.motion.skeleton import Motion, Skeleton, describe_skeleton, described_skeleton
@@ -243,6 +243,8 @@ def generate_crowd(
         **{name: trained.record.get(name) for name in ("dataset", "dataset_licence", "dataset_credit")},
     }  # fmt: skip
     settings = json.loads(json.dumps(settings))
+    if min_distance is not None:
+        checked_value("min_distance", min_distance, "float")
     out = Path(out)
     with locked(out.resolve().with_name(f".{out.resolve().name}.lock"), f"animating the crowd {out.name}"):
         finished = _num_finished(out, settings, overwrite)
@@ -362,11 +364,11 @@ def _num_finished(out: Path, settings: dict, overwrite: bool) -> int:
         check_own_folder(out)
         return 0
     there = _read_settings(out)  # also before overwriting: what is not ours stays
+    unlike = [name for name, value in settings.items() if there.get(name) != value]
     if overwrite:
-        return 0
-    if unlike := [name for name, value in settings.items() if there.get(name) != value]:
-        what = f"holds a crowd made with another {unlike[0]}"
-        raise ValueError(f"{out}: {what}; pass overwrite=True or choose another folder")
+        return 0 if unlike or there["num_finished"] == settings["num_characters"] else there["num_finished"]
+    if unlike:
+        raise ValueError(f"{out}: holds a crowd made with another {unlike[0]}; pass --overwrite or another folder")
     return there["num_finished"]
 
 

@@ -47,9 +47,9 @@ def crowd_motions(crowd, shown, credit: str, folder: Path, formats) -> None:
 
     Files of an earlier crowd are removed first; what else lies there stays. A new folder is there whole or not at all.
     """
-    digits = len(str(len(crowd) - 1))
+    digits, styles = len(str(len(crowd) - 1)), "|".join(map(re.escape, crowd.settings["styles"]))
     for file in folder.glob("*"):
-        if re.fullmatch(r"\d+_.*\.(bvh|glb|csv)", file.name):
+        if re.fullmatch(rf"\d+_({styles})\.(bvh|glb|csv)", file.name):
             file.unlink()
     with contextlib.nullcontext(folder) if folder.exists() else whole_folder(folder) as place:
         for character in tqdm(range(len(crowd)), "writing motions"):

@@ -131,8 +131,7 @@ def load_packed(path) -> PackedMotion:
     with errors_name(path):
         arrays, about = load_tree(path, {}, rest=True)
         check_kind(about, _KIND)
-        parts = {name: np.asarray(array) for name, array in arrays.items()}
-        parts |= {name: _tuples(value) for name, value in about.items()}
+        parts = {n: np.asarray(a) for n, a in arrays.items()} | {n: _tuples(v) for n, v in about.items()}
         parts |= {"name": about["dataset"], "mirror_styles": frozenset(about["mirror_styles"])}
         parts["skeleton"] = described_skeleton(about, about["offsets"])
         return PackedMotion(**{field.name: parts[field.name] for field in fields(PackedMotion)})
@@ -176,5 +175,8 @@ def packed_dataset(dataset: Dataset, *, progress: bool = True) -> PackedMotion:
         except ValueError as error:
             warnings.warn(f"{error} (packing anew)", stacklevel=2)
     packed = pack(dataset, progress=progress)
-    save_packed(path, packed)
+    try:
+        save_packed(path, packed)
+    except OSError as error:
+        warnings.warn(f"{path}: not kept ({error.strerror}); let F3AMD_CACHE_DIR name another folder", stacklevel=2)
     return packed

@@ -319,8 +319,3 @@ def sigma_from_alpha_bar(alpha_bar):
 def log_snr_from_sigma(sigma):
     """Return the log signal-to-noise ratio, -2 log sigma, any shape."""
     return -2.0 * array_module(sigma).log(sigma)
-
-
-def sigma_from_log_snr(log_snr):
-    """Return sigma = exp(-log_snr / 2), any shape."""
-    return array_module(log_snr).exp(-0.5 * log_snr)

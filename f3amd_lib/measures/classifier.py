@@ -204,14 +204,12 @@ def _network(config: ClassifierConfig, params, statistics) -> StyleNetwork:
     return nnx.merge(_blank(config)[0], params, jax.tree.map(lambda leaf: leaf, statistics))
 
 
-@functools.partial(jax.jit, static_argnums=0)
-def _evaluate(config: ClassifierConfig, params, statistics, windows):
-    return _network(config, params, statistics)(windows)
+_evaluate = jax.jit(lambda config, weights, windows: _network(config, *weights)(windows), static_argnums=0)
 
 
 def _answers(config, params, statistics, windows) -> tuple[np.ndarray, np.ndarray]:
     """Return (features, scores) of windows [N, window, 45], a fixed number at a time."""
-    return in_batches(lambda rows: _evaluate(config, params, statistics, windows[rows]), len(windows), _BATCH)
+    return in_batches(lambda rows: _evaluate(config, (params, statistics), windows[rows]), len(windows), _BATCH)
 
 
 # ----------------------------------------------------------------------------------- the classifier

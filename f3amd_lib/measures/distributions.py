@@ -303,6 +303,8 @@ def intervals_over_repeats(rows: pd.DataFrame, columns: Sequence[str]) -> pd.Dat
 def of_seeds(table: pd.DataFrame, keys: Sequence[str], length: float = 1.0) -> pd.DataFrame:
     """Return a table after so much of the usual length, 0 of which has no training: means over `seeds` of each row.
 
+    `trainings` has the figure of each, by the digest of its weights where the table has them.
+
     An interval is that of the seeds, or of the repeats of one, where that is the wider. A table without lengths and
     seeds has one.
     """
@@ -312,8 +314,10 @@ def of_seeds(table: pd.DataFrame, keys: Sequence[str], length: float = 1.0) -> p
     for _, rows in table[table["length"].isin([0.0, length])].groupby(list(keys), sort=False, dropna=False):
         over, repeats = mean_and_interval(rows["value"]), rows[["low", "high"]].mean()
         bounds = {"low": np.fmin(over["low"], repeats["low"]), "high": np.fmax(over["high"], repeats["high"])}
-        found.append({**rows.iloc[0], "value": over["value"], **bounds, "seeds": rows["seed"].nunique()})
-    return pd.DataFrame(found, columns=[*table, "seeds"])
+        each = dict(zip(rows.get("weights", ()), rows["value"], strict=False))
+        bounds |= {"seeds": rows["seed"].nunique(), "trainings": each}
+        found.append({**rows.iloc[0], "value": over["value"], **bounds})
+    return pd.DataFrame(found, columns=[*table, "seeds", "trainings"])
 
 
 # --------------------------------------------------------------------------------------- settling

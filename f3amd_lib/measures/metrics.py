@@ -240,8 +240,8 @@ def ird(positions, window: int):
 
         100 * mean_{seams k, joints j} || p_{t_k + 1, j} - p_{t_k, j} ||.
 
-    Real motion does not read 0 here but a walker's ordinary step (4 to 6 cm at 30 fps): set
-    `inter_frame_step` of real clips beside it. Below that, the character sticks at the seam.
+    Real motion does not read 0 here but a walker's ordinary step (some 4 cm at 30 fps): set
+    `inter_frame_step` beside it. Well below its own ordinary step, a character sticks at the seam.
 
     Args:
       positions: [..., T, J, 3], metres.

@@ -10,7 +10,7 @@ from itertools import groupby
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
-from f3amd_lib.measures.metrics import foot_sliding, joint_acceleration
+from f3amd_lib.measures.metrics import checked_positions, foot_sliding, joint_acceleration
 from f3amd_lib.motion.rotations import matrix_from_yaw
 from f3amd_lib.motion.skeleton import Motion, Skeleton, contact_labels, facing_yaw
 
@@ -28,8 +28,8 @@ SHORTEST_SUPPORT = 3
 
 
 def toe_positions(positions, skeleton: Skeleton) -> np.ndarray:
-    """Return the toes' positions, [..., T, 2, 3], left and right as in `Skeleton.toes`."""
-    return np.asarray(positions, np.float64)[..., list(skeleton.toes), :]
+    """Return the toes' positions, [..., T, 2, 3], left and right as in `Skeleton.toes`; ValueError for NaN."""
+    return checked_positions(positions)[..., list(skeleton.toes), :]
 
 
 def stepping_rate(positions, skeleton: Skeleton, fps: float = 30.0):

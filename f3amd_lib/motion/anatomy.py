@@ -66,7 +66,8 @@ def joint_roles(skeleton) -> dict[str, int]:
     if not limbs:
         return {"hips": 0} | _by_names_alone(skeleton) | called
     hips, *legs = limbs[0]
-    root = 0 if _length(skeleton, joint_chain(skeleton, hips, 0)) < 0.05 * ways[legs[0]][0] else hips
+    way = np.linalg.norm(skeleton.offsets[joint_chain(skeleton, hips, 0)[1:]], axis=-1).sum()
+    root = 0 if way < 0.05 * ways[legs[0]][0] else hips
     above = [pair for pair in limbs[1:] if pair[0] != hips and len(joint_chain(skeleton, pair[0], root)) > 1]
     chest, *arms = max(above, key=lambda pair: ways[pair[1]][0], default=(hips,))
     roles = {"hips": root} | _upwards(skeleton, ways, root, chest, [*legs, *arms])
@@ -89,11 +90,6 @@ def leg_length(skeleton, roles: dict[str, int]) -> float:
 def part_of(role: str) -> str:
     """Return a role without its side and number: knee, spine."""
     return role.removeprefix("left_").removeprefix("right_").split("_")[0]
-
-
-def _length(skeleton, chain) -> float:
-    """Return the length of the bones of a chain of joints, the first one's own apart."""
-    return float(np.linalg.norm(skeleton.offsets[chain[1:]], axis=-1).sum())
 
 
 def _longest_ways(skeleton) -> list[tuple[float, list[int]]]:

@@ -335,9 +335,12 @@ def format_bvh(motion: Motion) -> str:
     """Return a motion as BVH text in centimetres: six channels at the root, R = Rz Rx Ry at every joint.
 
     Joints are written depth first, as BVH requires; line ends are LF, numbers have six decimals. Read again, joint
-    positions agree to 1e-6 m.
+    positions agree to 1e-6 m. ValueError for rotations that stretch or mirror.
     """
     rotations, skeleton, depth_first = motion.needed_rotations("a BVH file"), motion.skeleton, []
+    turned = np.abs(rotations @ np.swapaxes(rotations, -1, -2) - np.eye(3)).max(axis=(-2, -1)) < 1e-3
+    if wrong := np.argwhere(~turned | (np.linalg.det(rotations) < 0.0)).tolist():
+        raise ValueError(f"{motion.name}: frame {wrong[0][0]}, joint {wrong[0][1]}: not a rotation matrix")
     offset_line = lambda offset: "OFFSET " + " ".join(f"{100.0 * float(value):.6f}" for value in offset)
 
     def block(joint: int, kind: str) -> list[str]:

@@ -46,6 +46,4 @@ def _count_equation(equation) -> int:
         raise ValueError("a while loop has no fixed number of rounds: its operations are unknown")
     # What an equation calls: jit, scan, custom gradients, branches.
     inner = [_count(jaxpr) for jaxpr in jaxprs_in_params(parameters)]
-    if name == "cond":
-        return max(inner)
-    return sum(inner) * (parameters["length"] if name == "scan" else 1)
+    return max(inner) if name == "cond" else sum(inner) * (parameters["length"] if name == "scan" else 1)

@@ -136,7 +136,7 @@ def model_files(profile: Profile, preset: str | None = None, *, folder=None) -> 
       preset: by default the profile's own.
       folder: instead of `runs/<data set>/<profile>/models`.
     """
-    name = presets.find_preset(preset or profile.preset).name
+    name = presets.find_preset(profile.preset if preset is None else preset).name
     if profile.window != 32:
         name += f"-{profile.window}frames"
     return ModelFiles.of(runs_dir(profile.dataset, profile.name) / "models" if folder is None else folder, name)
@@ -167,7 +167,7 @@ def train(
         trains the same there, or the devices cannot share a batch equally.
       TrainingDiverged: if the loss stops being a number.
     """
-    preset = presets.find_preset(preset or profile.preset).name
+    preset = presets.find_preset(profile.preset if preset is None else preset).name
     files = model_files(profile, preset, folder=folder)
     config = config or profile_recipe(profile, preset)
     if mesh is not None and config.batch_size % mesh.size:
@@ -286,7 +286,7 @@ def obtain_model(
     Returns:
       (model, history, origin), origin being "shipped", "earlier run" or "trained now".
     """
-    preset = presets.find_preset(preset or profile.preset).name
+    preset = presets.find_preset(profile.preset if preset is None else preset).name
     wanted, data = prepared.model_config(preset), prepared.packed
     shipped = model_files(profile, preset, folder=PRETRAINED_DIR / profile.dataset)
     if profile.name == "laptop" and shipped.model.exists():

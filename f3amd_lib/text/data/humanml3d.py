@@ -134,7 +134,7 @@ def _listed(folder: Path) -> tuple[dict[str, str], list[tuple[str, str]]]:
                 splits[name] = split
     if missing:
         # A clip and its mirror image, M and its name, belong together.
-        bare = {name: name.removeprefix("M") for name, split in splits.items() if split == "train"}
+        bare = {n: own if (own := n.removeprefix("M")) in splits else n for n in splits if splits[n] == "train"}
         held = assign_splits(((name, "all") for name in set(bare.values())), percent=HELD_OUT_PERCENT)
         splits |= {name: held[own] for name, own in bare.items() if held[own] in missing}
         what = " and ".join(SPLIT_FILES[split] for split in missing)

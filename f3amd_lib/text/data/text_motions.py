@@ -171,8 +171,8 @@ class TextMotions:
     def redundant_vectors(self, *, released: bool = True) -> np.ndarray:
         """Return redundant vectors of all frames, [N, 12 J - 1], float32, by the released facing or the earlier one.
 
-        Those stored with the data are taken as they are, so that a part of a motion faces as it does in the whole. Of
-        those computed, a clip's last frame has no next one to step to: it is taken to go on as it moves.
+        Those stored with the data have the released facing and are taken as they are, so that a part faces as it does
+        in the whole. Of those computed, a clip's last frame has no next one to step to: it is taken to go on.
         """
         return _stacked(self._vectors(released))
 
@@ -192,7 +192,7 @@ class TextMotions:
 
     def _vectors(self, released: bool) -> Iterator[np.ndarray]:
         """Yield the redundant vectors of each clip."""
-        stored = self.stored or [(None, 0)] * self.num_clips
+        stored = (self.stored if released else None) or [(None, 0)] * self.num_clips
         for (file, first), clip in zip(stored, self._going_on(), strict=True):
             vectors = [np.nan] if file is None else np.load(file, mmap_mode="r")[first : first + len(clip) - 1]
             if not np.isfinite(vectors).all():

@@ -419,9 +419,10 @@ def load_judge(path: Path) -> TextJudge:
 
 
 def judged_clips(data: TextMotions) -> TextMotions:
-    """Return the test clips that can be judged: those of pairs with enough clips, or all where none shares its pair."""
+    """Return the test clips that can be judged: those of pairs with enough clips, or all where no pair has."""
     pairs, counts = np.unique(data.pairs, return_counts=True)
-    known = {*pairs[counts >= (CLASS_CLIPS if counts.max() > 1 else 1)]}  # HumanML3D's pairs are names of clips
+    # HumanML3D's pairs are names of clips.
+    known = {*pairs[counts >= (CLASS_CLIPS if counts.max() >= CLASS_CLIPS else 1)]}
     chosen = [clip for clip in data.members("test") if data.pairs[clip] in known]
     if not chosen:
         raise ValueError(f"data set {data.name!r} has no pair of content and style with enough clips to judge by")

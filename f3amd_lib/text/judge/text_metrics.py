@@ -9,6 +9,7 @@ Source: Guo et al. 2022 (HumanML3D) and its released code; ACMDM, section 4.1 an
 import numpy as np
 from scipy.sparse import coo_array
 
+from f3amd_lib.ground.arrays import finite_array
 from f3amd_lib.motion.skeleton import Skeleton
 
 GROUP = 32
@@ -54,7 +55,8 @@ def r_precision(text, motion) -> np.ndarray:
       [3]; guessing gives k / size. A motion as near as the right one counts as nearer, so that
       a judge that sees nothing scores 0.
     """
-    text, motion = np.asarray(text, np.float64), np.asarray(motion, np.float64)
+    text = finite_array("text", text, ("group", "text", "feature"))
+    motion = finite_array("motion", motion, text.shape)
     distance = np.linalg.norm(text[:, :, None] - motion[:, None], axis=-1)
     own = np.diagonal(distance, axis1=1, axis2=2)
     rank = np.sum(distance <= own[..., None], axis=-1) - 1
@@ -112,7 +114,7 @@ def raised_hands(skeleton: Skeleton, positions) -> np.ndarray:
 
     Source: ours.
     """
-    height = np.asarray(positions)[..., 1]
+    height = finite_array("positions", positions, (*np.shape(positions)[:-1], 3))[..., 1]
     wrists = height[..., [skeleton.role("left_wrist"), skeleton.role("right_wrist")]]
     return np.max(wrists - height[..., [skeleton.role("head")]], axis=-2) > RAISED
 
@@ -130,7 +132,7 @@ def foot_skating_ratio(skeleton: Skeleton, positions, fps: float = 20.0) -> floa
 
     Source: ACMDM's released evaluation, on the clip's true length.
     """
-    toes = np.asarray(positions, np.float64)[:, list(skeleton.toes)]
+    toes = finite_array("positions", positions, ("frame", "joint", 3))[:, list(skeleton.toes)]
     low = toes[..., 1] < 0.05
     speed = np.linalg.norm(np.diff(toes[..., ::2], axis=0), axis=-1) * fps
     window = min(5, len(speed))
@@ -151,7 +153,8 @@ def control_errors(positions, wanted, given) -> dict[str, float]:
       control_location_error: share of points missed;
       control_average_error: mean distance at the points, metres.
     """
-    given, distance = np.asarray(given, bool), np.linalg.norm(np.subtract(positions, wanted), axis=-1)
+    given = np.asarray(given, bool)
+    distance = finite_array("distance", np.linalg.norm(np.subtract(positions, wanted), axis=-1), given.shape)
     over_clips = lambda at_points: float(np.mean(at_points, axis=(1, 2), where=given).mean())
     return {
         "control_trajectory_error": float(((distance > 0.5) & given).any(axis=(1, 2)).mean()),

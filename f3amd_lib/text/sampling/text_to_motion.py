@@ -5,6 +5,7 @@ positions or latents in network units; `text.stages.text_models` makes metres of
 """
 
 from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -160,7 +161,7 @@ def sample_blocks(
         last = min(first + size, frames)
         told = [context._replace(mask=context.mask[:, :last]) for context in contexts]
         if cached:
-            predicts = [_with_past(network, *pair) for pair in zip(told, pasts, strict=True)]
+            predicts = [partial(network, context=context, past=past) for context, past in zip(told, pasts, strict=True)]
         else:
             predicts = [_after_clean(network, context, made) for context in told]
         predict = predicts[0] if guidance == 1.0 else guided(*predicts, guidance)
@@ -170,10 +171,6 @@ def sample_blocks(
         if cached and last < frames:
             pasts = [network.remember(block, *pair) for pair in zip(told, pasts, strict=True)]
     return without_padding(made, condition.mask)
-
-
-def _with_past(network: ACMDM, context, past) -> Predict:
-    return lambda state, time: network(state, time, context, past=past)
 
 
 def _after_clean(network: ACMDM, context, before) -> Predict:

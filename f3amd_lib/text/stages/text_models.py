@@ -245,7 +245,8 @@ class TextModel(CaptionedModel):
     @classmethod
     def of(cls, tree: dict, autoencoder: CheckedConfig | None, said: dict, about: dict) -> TextModel:
         """Return the model of a file's tree and description; `about` is what all kinds have."""
-        axes, latent, redundancy = (_normaliser(tree.get(what)) for what in ("axes", "latent", "redundancy"))
+        parts = (tree.get(what) for what in ("axes", "latent", "redundancy"))
+        axes, latent, redundancy = (part and AxisNormaliser(**jax.tree.map(np.asarray, part)) for part in parts)
         mesh = None
         if "rest" in tree:
             rest = dataclasses.replace(about["skeleton"], offsets=np.asarray(tree["rest"]))
@@ -297,10 +298,6 @@ class LatentModel(CaptionedModel):
         """Return the model of a file, as `TextModel.of`."""
         about |= {"statistics": AxisNormaliser(tree["mean"], tree["deviation"]), "empty": tree.get("empty", 0.0)}
         return cls(autoencoder=autoencoder, autoencoder_params=tree["autoencoder"], **about)
-
-
-def _normaliser(arrays: dict | None) -> AxisNormaliser | None:
-    return None if arrays is None else AxisNormaliser(**jax.tree.map(np.asarray, arrays))
 
 
 def controlled_joints(skeleton: Skeleton) -> dict[str, int]:
@@ -464,10 +461,11 @@ def find_text_model(
     denoisers = [name for name, known in presets.PRESETS.items() if known.family in DENOISERS]
     names = [wanted] if preset else [name + form for name in denoisers for form in ("", *presets.FORMS)]
     for folder, branch in itertools.product(text_model_folders(dataset), branches):
-        files = (folder / f"{name}{branch}.safetensors" for name in names)
-        if found := [path for path in files if path.is_file()]:
+        if found := [path for name in names if (path := folder / f"{name}{branch}.safetensors").is_file()]:
             return max(found, key=lambda path: path.stat().st_mtime)
     told = wanted + branches[0]
+    if dataset not in ("bandai", "folder") or presets.find_preset(wanted).paper == "f3amd":
+        raise ValueError(f"no model {wanted} of captions for data set {dataset!r}: f3amd text --help has both")
     raise ValueError(f"no trained {told} for data set {dataset!r}: f3amd train --preset {told} --data {dataset}")
 
 

@@ -52,9 +52,7 @@ def stage_of(name: str) -> str:
     preset = presets.find_preset(base)
     if preset.family not in STAGES:
         raise ValueError(f"{name} needs no captions: train it in a separate call")
-    if branch:
-        return "control branch"
-    return "student" if preset.network.get("guidance_features") else preset.family
+    return "control branch" if branch else "student" if preset.network.get("guidance_features") else preset.family
 
 
 def stands_on(name: str) -> str:
