@@ -2,6 +2,7 @@
 
 import functools
 from itertools import product
+from types import SimpleNamespace
 
 import claims_page
 import numpy as np
@@ -40,6 +41,7 @@ from f3amd_companion.ledger.judgements import (
     every,
     majority,
     ordered,
+    ranked,
     stated_factor,
     within,
 )
@@ -528,6 +530,21 @@ def test_a_claim_follows_from_its_statements(parts, verdict):
 )
 def test_a_statement_on_many_figures_goes_by_the_majority(figures, verdict):
     assert majority(figures) == majority(reversed(figures)) == verdict
+
+
+@pytest.mark.parametrize(
+    ("values", "verdict"), [((1, 2, 3), HOLDS), ((1, 3, 2), IN_PART), ((2, 1, 3), FAILS), ((3, 1, 2), FAILS)]
+)
+def test_an_order_whose_best_is_wrong_does_not_hold(values, verdict):
+    evidence = SimpleNamespace(printed=False, figure=lambda _, of, **row: Figure.of(of, 0.99 * of, 1.01 * of))
+    assert ranked(evidence, "quality", "FID", [{"of": value} for value in values])[0] == verdict
+
+
+def test_figures_of_the_same_networks_are_paired():
+    """Each loses a tenth, however unlike they are."""
+    few = {"a": 1.0, "b": 10.0, "c": 100.0}
+    more, few = (Figure.of(37, 1, 100, {one: by * each for one, each in few.items()}) for by in (1.1, 1.0))
+    assert ratio(more, few).low == pytest.approx(1.1) and ratio(more, few._replace(trainings=None)).low < 1
 
 
 # --------------------------------------------------------------------------------------------- the gate

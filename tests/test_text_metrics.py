@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from builders import refused
 
 from f3amd_lib.measures import registry
 from f3amd_lib.motion.skeleton import Skeleton
@@ -25,6 +26,7 @@ def test_r_precision_of_an_oracle_and_of_guessing():
     # Right motion under another caption, and a judge that sees nothing at all.
     assert text_metrics.r_precision(text, np.roll(text, 1, axis=1)).max() < 0.1
     assert np.array_equal(text_metrics.r_precision(0 * text, 0 * text), [0, 0, 0])
+    refused("motion is not finite", text_metrics.r_precision, text, np.nan * text)
 
 
 def test_r_precision_by_hand():
@@ -107,6 +109,8 @@ def test_control_errors_by_hand():
     given[0, [2, 5, 7, 9], 1] = True
     given[1, 5, 1] = True
     made = wanted + [0.0, 0.4, 0.0]  # everywhere, which is less than half a metre
+    refused("not finite", text_metrics.control_errors, np.nan * wanted, wanted, given)
+    refused("not finite", text_metrics.foot_skating_ratio, SKELETON, np.nan * wanted[0])
     exact = text_metrics.control_errors(wanted, wanted, given)
     assert set(exact.values()) == {0.0} and set(exact) <= set(registry.METRICS)
     near = text_metrics.control_errors(made, wanted, given)
