@@ -72,6 +72,7 @@ def _faults(evidence: Evidence, rule: Callable, verdict: str, networks: Collecti
     alone = networks if not beside and len({(one.model, one.window, one.row) for one in networks}) == 1 else ()
     if all(one.timed for one in networks):  # weights do not change times, sizes do
         yield from (("a smaller network of ours in its place", one) for one in alone if one.trained != one.model)
+        yield from (("timed once", one) for one in networks if one.seeds == 1)
         return
     # How much a network saw stands in the row of a table of text to motion, and in a table of its own of others.
     row = lambda one: {"model": one.model, "window_frames": one.window, "metric": "windows"}

@@ -196,9 +196,7 @@ def _list_text(items: Iterable) -> str:
 
 
 def _change_text(figure: Figure) -> str:
-    if figure.value >= 2.0:
-        return f"{number_text(figure.value)}x"
-    return f"{100.0 * (figure.value - 1.0):+.3g} %"
+    return f"{number_text(figure.value)}x" if figure.value >= 2.0 else f"{100.0 * (figure.value - 1.0):+.3g} %"
 
 
 # ------------------------------------------------- six kinds that most statements are judged by

@@ -185,9 +185,9 @@ def real_rows(packed: PackedMotion, clips: Sequence[int], *, window: int = 32) -
     figures = []
     for clip in clips:
         motion = packed.motion(clip)
-        figures.append(_figures(motion, real_clips.own_path(motion), window, float(packed.floor_shift[clip])))
-    columns = {"grid": "real", "update": "real", "steps": 0, "walks": len(figures), "diverged": 0}
-    return _table(pd.DataFrame(figures), **columns)
+        floor = real_clips.style_floor(packed, packed.styles[packed.clip_style[clip]])
+        figures.append(_figures(motion, real_clips.own_path(motion), window, floor))
+    return _table(pd.DataFrame(figures), grid="real", update="real", steps=0, walks=len(figures), diverged=0)
 
 
 # ------------------------------------------------------------------------------------ likeness to the paper's network

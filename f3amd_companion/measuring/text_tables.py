@@ -354,7 +354,7 @@ def control_rows(bench: Bench, trained: TextModel, row: Mapping, about: Mapping,
     each = table.groupby(["joint", "frames", "metric"], sort=False)["value"].mean().reset_index()
     draw, _ = control_drawer(bench, trained, section, clips[:1], pooled[:1])
     asked = asked_of([0], np.ones((1, lengths[0]), bool))
-    seconds = median_seconds(lambda number: draw(asked, jax.random.fold_in(key, number)), 1)
+    seconds = median_seconds(lambda number: draw(asked, jax.random.fold_in(key, number)), 5)
     taken = {"joint": each["joint"].iloc[-1], "metric": "sampling_seconds", "value": seconds}
     means = each.groupby(["joint", "metric"], sort=False)["value"].mean().reset_index()
     return {"text_table3": pd.concat([means, pd.DataFrame([taken])]), "text_control": each}

@@ -388,11 +388,11 @@ def measure_real(
     require_telling_styles(classifier)
     clips, labels = held_out_clips(packed, protocol.styles, window)
     motions, figures = [], []
-    for clip in clips:
+    for clip, style in zip(clips, labels, strict=True):
         whole = packed.motion(int(clip))
         motion = whole if model == "real" else corrupt(model, whole, seed=int(clip))
         motions.append(motion)
-        floor = float(packed.floor_shift[clip])
+        floor = real_clips.style_floor(packed, style)  # as of models
         values = _figures_without_classifier(motion, real_clips.own_path(whole), window, floor)
         figures.append({name: value for name, value in values.items() if name not in _GROWS_WITH_LENGTH})
     seen = classify_windows(classifier, motions, labels)
