@@ -38,7 +38,8 @@ def check_there(*files: Path | str | None) -> None:
 def check_writable(*targets: Path) -> None:
     """Raise ValueError if one of the files or folders cannot be created."""
     for target in targets:
-        folder = next(folder for folder in (target.absolute(), *target.absolute().parents) if folder.is_dir())
+        inside = target if target.is_file() else target / "a file"
+        folder = next(folder for folder in inside.absolute().parents if folder.exists())
         try:
             with tempfile.TemporaryFile(dir=folder):
                 pass

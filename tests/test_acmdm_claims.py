@@ -55,7 +55,7 @@ def world(true=True):
     three += rows({S: 1}, seconds, **everywhere, joint="average")
     three += rows({S: 11 if true else 1}, seconds, error, **search)
     three += rows({S: 0.003 if true else 3.0}, missed, **search)
-    three += rows({S: 1}, "held_out_loss", "acceleration_ratio", **search)
+    three += rows({S: 1}, "held_out_loss", **search) + rows({S: 10}, "acceleration_ratio", **search)
     three += rows(order(S, "OmniControl", "MotionLCM V2+CtrlNet", "MDM"), section="upper-body edit", joint="")
     ahead, true_first = (1.05, 0.5) if true else (9.0, 20.0)
     forms = {f"ACMDM-S-PS2-{form}": bad for form, bad in (("prefix", ahead), ("noisy-condition", ahead), ("masked", 1))}

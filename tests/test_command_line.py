@@ -327,7 +327,7 @@ def test_what_is_cheap_is_said_before_jax_is_loaded(weights, tmp_path, capsys):
         ["steer", "--weights", "missing.safetensors"],
         ["text", "walks", *nowhere],
         ["train", *nowhere],
-        ["data", "--source", "missing.zip"],
+        ["data", "--source", "missing.zip", "--data", "folder"],
         ["data", "--data", "bandei"],
     ]
     script = f"""

@@ -118,7 +118,7 @@ def work(tmp_path, monkeypatch, weights, measured) -> Work:
         rows = lambda row: pd.DataFrame({"seed": [0, 1], "value": [value(row), -value(row)]})
         return records.measure(todo, lambda row: {"walking": rows(row)})
 
-    monkeypatch.setattr(sweep, "_opened", lambda profile, source: SimpleNamespace(packed=packed))
+    monkeypatch.setattr(sweep, "_opened", lambda profile, path=None: SimpleNamespace(packed=packed))
     monkeypatch.setattr(sweep, "obtain_model", lambda *a, preset, **k: (trained(preset), None, "shipped"))
     monkeypatch.setitem(sweep.MEASUREMENTS, "walking", measure)
     monkeypatch.setenv("F3AMD_RESULTS_DIR", str(tmp_path / "one process"))
@@ -285,7 +285,7 @@ def make_small(folder: Path, waits: bool, setattr=setattr) -> None:
 
     setattr(presets, "build_config", lambda *a, **k: build(*a, **{**k, "depth": 1, "latent_width": 8}))
     setattr(campaign, "measure_model", measure_model)
-    setattr(sweep, "_opened", lambda profile, source: prepared)
+    setattr(sweep, "_opened", lambda profile, path=None: prepared)
     setattr(sweep, "protocol_of", lambda *a: judges)
     setattr(sweep, "MEASUREMENTS", {name: waiting(measure) for name, measure in sweep.MEASUREMENTS.items()})
     setattr(pipeline, "runs_dir", lambda *names: folder.joinpath("runs", *names))
