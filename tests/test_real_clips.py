@@ -84,10 +84,8 @@ def test_real_clips_and_rollouts_are_measured_alike(packed):
     clips = [4, 9]
     real = walk_tables.measure_clips(packed, clips, window=WINDOW)
     motions = [packed.motion(clip) for clip in clips]
-    paths, styles = map(real_clips.own_path, motions), [packed.styles[packed.clip_style[clip]] for clip in clips]
-    again = walk_tables.measure_rollout(
-        rollout_of(motions, list(paths)), [real_clips.style_floor(packed, style) for style in styles]
-    )
+    floors = [real_clips.style_floor(packed, packed.styles[packed.clip_style[clip]]) for clip in clips]
+    again = walk_tables.measure_rollout(rollout_of(motions, [*map(real_clips.own_path, motions)]), floors)
     assert set(real) == {metric.key for metric in SHOWN["first"]} | {"foot_alternation_hz", "bone_swing_deg"}
     for key, values in real.items():
         np.testing.assert_allclose(again[key], values, atol=1e-6, err_msg=key)
