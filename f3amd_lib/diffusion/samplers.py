@@ -223,9 +223,9 @@ def _legs(name: str, x_init, sigmas, alphas, key) -> tuple[Sampler, tuple]:
     check_known(name, SAMPLERS, "sampler")
     xp = array_module(x_init, sigmas, key)
     sampler, sigmas = SAMPLERS[name], xp.asarray(sigmas, dtype=xp.result_type(x_init, 1.0))
-    if sigmas.ndim != 1 or len(sigmas) < 2 or (xp is np and not (np.diff(sigmas) < 0.0).all()):
+    if sigmas.ndim != 1 or len(sigmas) < 2 or (xp is np and (np.diff(sigmas) > 0.0).any()):
         raise ValueError(
-            f"sigmas must be [N + 1], falling, with at least one step, got shape {sigmas.shape}; "
+            f"sigmas must be [N + 1], never rising, with at least one step, got shape {sigmas.shape}; "
             "take them from a noise schedule's grid"
         )
     if sampler.draws_noise and key is None:
