@@ -256,7 +256,10 @@ def test_what_a_mirror_shows_otherwise_is_not_mirrored_and_empty_splits_are_said
 def test_nothing_is_written_over(bvh_folder, tmp_path):
     data = captioned(bvh_folder, {"take0": ("a walk",), "take1": ("a walk",)})
     (tmp_path / "mine.txt").write_text("mine")
-    refused("is not empty; choose another folder", captioned_folder.write_humanml3d, tmp_path, data)
+    refused("holds other files; choose an empty", captioned_folder.write_humanml3d, tmp_path, data)
+    (tmp_path / "mine.txt").rename(tmp_path / ".DS_Store")  # what a desktop leaves in an empty folder
+    captioned_folder.write_humanml3d(tmp_path, data)
+    assert (tmp_path / ".DS_Store").read_text() == "mine" and (tmp_path / "skeleton.json").exists()
 
 
 @pytest.mark.slow

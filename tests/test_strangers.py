@@ -71,8 +71,8 @@ def test_a_person_of_no_known_unit_is_refused_and_an_option_overrules_it():
     odd = still(Skeleton(NAMES, walker().skeleton.parents, 3.0 * walker().skeleton.offsets))
     refused("somebody: its legs are .* --scale", as_person, odd)
     motion, notes = as_person(odd, scale=0.01 / 3.0)
-    assert leg_length(motion.skeleton, joint_roles(motion.skeleton)) == pytest.approx(0.82)
-    assert notes
+    assert leg_length(motion.skeleton, joint_roles(motion.skeleton)) == pytest.approx(0.82) and notes
+    refused("somebody: units of 1e-12 m are no scale of a walker: its legs are", as_person, odd, scale=1e-12)
 
 
 def test_a_joint_map_overrules_what_the_tree_says(tmp_path, caplog):

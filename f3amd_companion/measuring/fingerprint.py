@@ -183,9 +183,7 @@ def window_rows(trained: TrainedModel, held_out: WindowSet, *, num_windows: int 
 def real_rows(packed: PackedMotion, clips: Sequence[int], *, window: int = 32) -> pd.DataFrame:
     """Measure real clips by the same figures, each against its own smoothed path; grid and update are "real"."""
     figures = []
-    for clip in clips:
-        motion = packed.motion(clip)
-        floor = real_clips.style_floor(packed, packed.styles[packed.clip_style[clip]])
+    for motion, floor in zip(map(packed.motion, clips), real_clips.clip_floors(packed, clips), strict=True):
         figures.append(_figures(motion, real_clips.own_path(motion), window, floor))
     return _table(pd.DataFrame(figures), grid="real", update="real", steps=0, walks=len(figures), diverged=0)
 

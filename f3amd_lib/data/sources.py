@@ -491,7 +491,9 @@ def _open_100style(path) -> Dataset:
     """List the takes of 100STYLE inside the ranges of its Frame_Cuts.csv."""
     place, files = _find_files("100style", path)
     members = _by_stem(files)
-    cuts, symmetric = _read_frame_cuts(place, files), _read_symmetric(place, files)
+    cuts = _read_frame_cuts(place, files)
+    _, rows = _read_table(place, files, "Dataset_List.csv", ["Style Name", "Symmetric"])
+    symmetric = set(rows["Style Name"][rows["Symmetric"].str.strip() == "Yes"].str.strip())
     # A transition take may be called TR for TR1, as in the author's own exporter.
     for style, _ in cuts:
         if f"{style}_TR1" not in members and f"{style}_TR" in members:
@@ -547,12 +549,6 @@ def _read_frame_cuts(place: Path, files: Mapping[str, _File]) -> dict[tuple[str,
                 raise ValueError(f"{label}, line {line}: {what}; it needs two rising whole numbers, or N/A twice")
             cuts[style, code] = (int(start), int(stop))
     return cuts
-
-
-def _read_symmetric(place: Path, files: Mapping[str, _File]) -> set[str]:
-    """Return the styles that stay themselves in a mirror."""
-    _, rows = _read_table(place, files, "Dataset_List.csv", ["Style Name", "Symmetric"])
-    return set(rows["Style Name"][rows["Symmetric"].str.strip() == "Yes"].str.strip())
 
 
 def _open_folder(path, retarget: bool, person: Mapping) -> Dataset:

@@ -96,14 +96,16 @@ def whole_folder(path) -> Iterator[Path]:
     """Yield a temporary folder beside `path`, which becomes `path` at the end; if the block fails, it is removed.
 
     Args:
-      path: the folder wanted, which must be empty or not there; missing folders above it are made.
+      path: the folder wanted, which must be not there or empty but for hidden files, which are kept; missing folders above it are made.
 
     Raises:
       OSError: if something has appeared at `path` meanwhile.
     """
-    with _unfinished(Path(path).resolve()) as temporary:
+    with _unfinished(path := Path(path).resolve()) as temporary:
         temporary.mkdir()
         yield temporary
+        for hidden in path.glob(".*"):  # such as .DS_Store in a folder that looks empty
+            os.replace(hidden, temporary / hidden.name)
 
 
 def check_own_folder(folder: Path, mark: str = "") -> None:

@@ -43,11 +43,9 @@ def held_out_condition(windows: WindowSet, trained: TrainedModel, num_conditions
 
 def root_mean_square(squares) -> dict:
     """Return the root of a mean over windows, [W], of squares in square metres, in cm, with its 95 % interval."""
-    interval = mean_and_interval(squares)
-    for bound in ("value", "low", "high"):
-        # The interval of a mean of squares may reach below 0, that of its root may not.
-        interval[bound] = CM * float(np.sqrt(np.maximum(interval[bound], 0.0)))
-    return interval
+    interval, bounds = mean_and_interval(squares), ("value", "low", "high")
+    # The interval of a mean of squares may reach below 0, that of its root may not.
+    return interval | {bound: CM * float(np.sqrt(np.maximum(interval[bound], 0.0))) for bound in bounds}
 
 
 def _apart(positions, others) -> float:

@@ -82,19 +82,8 @@ def evaluation_paths(packed: PackedMotion, styles: Sequence[str], num_frames: in
     """Make the path that each style walks: one complex path, at the usual pace of the style.
 
     All get the same turns at the same times. Where the training clips hold (almost) no sideways or
-    backward steps, everybody faces where the path goes: anything else would test the data.
-
-    Args:
-      packed: the data set.
-      styles: labels of it.
-      num_frames: length.
-      seed: of the path.
-
-    Returns:
-      One path a style, each of `num_frames`.
-
-    Raises:
-      ValueError: for an unknown style.
+    backward steps, everybody faces where the path goes: anything else would test the data. An unknown style is a
+    ValueError.
 
     Source: paper section 4.4, which describes the trajectory but does not print it; ours.
     """
@@ -388,11 +377,10 @@ def measure_real(
     require_telling_styles(classifier)
     clips, labels = held_out_clips(packed, protocol.styles, window)
     motions, figures = [], []
-    for clip, style in zip(clips, labels, strict=True):
+    for clip, floor in zip(clips, real_clips.clip_floors(packed, clips), strict=True):
         whole = packed.motion(int(clip))
         motion = whole if model == "real" else corrupt(model, whole, seed=int(clip))
         motions.append(motion)
-        floor = real_clips.style_floor(packed, style)  # as of models
         values = _figures_without_classifier(motion, real_clips.own_path(whole), window, floor)
         figures.append({name: value for name, value in values.items() if name not in _GROWS_WITH_LENGTH})
     seen = classify_windows(classifier, motions, labels)

@@ -5,6 +5,7 @@ measured on real held-out clips too, in the same way and as if they had window s
 has them: the IRD of a real walker is a step, not zero, and "a walking person" is a set of numbers.
 """
 
+import functools
 from collections.abc import Sequence
 
 import numpy as np
@@ -52,10 +53,6 @@ def style_pace(packed: PackedMotion, style: str) -> float:
 
     A path should not make an exhausted walker run, which no data shows.
 
-    Args:
-      packed: the data set.
-      style: a label of it.
-
     Returns:
       Metres a second, at least 0.1: slower frames count as standing.
 
@@ -68,16 +65,14 @@ def style_pace(packed: PackedMotion, style: str) -> float:
 
 
 def style_floor(packed: PackedMotion, style: str) -> float:
-    """Return the height of a resting toe in a style: mean over its training clips, metres.
-
-    Args:
-      packed: the data set.
-      style: a label of it.
-
-    Raises:
-      ValueError: for an unknown style.
-    """
+    """Return the height of a resting toe in a style: mean over its training clips, metres; unknown: ValueError."""
     return float(np.mean(packed.floor_shift[training_clips(packed, style)]))
+
+
+def clip_floors(packed: PackedMotion, clips) -> list[float]:
+    """Return the `style_floor` of each clip's style, as rollouts in that style are measured."""
+    floor_of = functools.cache(functools.partial(style_floor, packed))
+    return [floor_of(packed.styles[packed.clip_style[clip]]) for clip in clips]
 
 
 def sideways_share(path: RootPath) -> float:
@@ -90,10 +85,8 @@ def sideways_share(path: RootPath) -> float:
     """
     step = np.diff(path.position, axis=0)
     moving = np.linalg.norm(step, axis=-1) * path.fps > STANDING
-    if not moving.any():
-        return 0.0
     off = wrap_angle(np.arctan2(step[:, 0], step[:, 1]) - path.yaw[:-1])
-    return float(np.mean(np.abs(off[moving]) > np.pi / 4))
+    return float(np.mean(np.abs(off[moving]) > np.pi / 4)) if moving.any() else 0.0
 
 
 def own_path(motion: Motion, frames: int = 41) -> RootPath:
@@ -103,18 +96,13 @@ def own_path(motion: Motion, frames: int = 41) -> RootPath:
     Against this line it gets the trajectory and direction error of somebody who walks well.
 
     Args:
-      motion: any motion.
       frames: span of the local parabolas that are fitted to position and yaw; 41 is more than a
         stride. Shorter motions take what they have.
-
-    Returns:
-      The path, [T].
     """
     from scipy.signal import savgol_filter  # here: half a second that few callers need
 
     path = path_from_motion(motion)
-    span = min(frames, path.num_frames)
-    span -= 1 - span % 2  # the filter wants an odd number
+    span = min(frames, path.num_frames - 1) // 2 * 2 + 1  # the filter wants an odd number
     if span < 5:
         return path
     return RootPath(savgol_filter(path.position, span, 2, axis=0), savgol_filter(path.yaw, span, 2), path.fps)

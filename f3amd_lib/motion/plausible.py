@@ -48,7 +48,8 @@ def as_person(
       (motion, notes): what had to be corrected, a sentence each. Motion without two legs is left as it is.
 
     Raises:
-      ValueError: for legs that are a person's in no unit; names the option that overrules it.
+      ValueError: for legs that are a person's in no unit, where it names the option that overrules it, or of no
+        walker's size at the scale told.
     """
     if joint_map:
         motion = call_by_roles(motion, joint_map)
@@ -64,7 +65,9 @@ def as_person(
     measure, factor = _unit(motion, roles) if scale is None and legs else told
     if factor != 1.0:
         motion = _mapped(motion, factor * np.eye(3), np.eye(3))
-        long = f": its legs are {leg_length(motion.skeleton, roles):.2f} m" if legs else ""
+        long = f": its legs are {leg_length(motion.skeleton, roles):.3g} m" if legs else ""
+        if legs and not 0.01 < leg_length(motion.skeleton, roles) < 100.0:
+            raise ValueError(f"{motion.name}: {measure} are no scale of a walker{long}")
         notes.append(f"read in {measure}{long}")
     if up == "Z" or (up is None and legs and _lies(motion, roles)):
         motion = _mapped(motion, _Z_UP, _Z_UP)

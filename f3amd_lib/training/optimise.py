@@ -148,11 +148,6 @@ def initial_state(task: Task, mesh: Mesh | None = None) -> TrainingState:
     return replicate(state, mesh)
 
 
-def _with_fast_gradients(params):
-    """Return the same weights, all matrices among them `with_fast_gradient`."""
-    return jax.tree.map(lambda weight: with_fast_gradient(weight) if jnp.ndim(weight) == 2 else weight, params)
-
-
 @functools.partial(jax.jit, static_argnames=("length", "mesh"), donate_argnames="state")
 def advance(task: Task, state: TrainingState, length: int, mesh: Mesh | None = None) -> tuple[TrainingState, dict]:
     """Train some steps in one program, without checkpoints or checks (see `optimise`).
@@ -167,11 +162,12 @@ def advance(task: Task, state: TrainingState, length: int, mesh: Mesh | None = N
       (state, every loss term of every step, [length] each).
     """
     decay, base = task.config.ema_decay, jax.random.fold_in(jax.random.key(task.config.seed), 1)
+    fast = lambda weight: with_fast_gradient(weight) if jnp.ndim(weight) == 2 else weight
 
     def one_step(state: TrainingState, _):
         batch, key = task.draw(state, jax.random.fold_in(base, state.step))
         batch = _laid(batch, mesh, SPREAD)
-        loss = lambda params, *rest: task.loss(_with_fast_gradients(params), *rest)
+        loss = lambda params, *rest: task.loss(jax.tree.map(fast, params), *rest)
         gradient, (terms, statistics) = jax.grad(loss, has_aux=True)(state.params, state.statistics, batch, key)
         updates, optimiser = task.optimiser.update(gradient, state.optimiser, state.params)
         params = optax.apply_updates(state.params, updates)

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 from f3amd_lib.data.packed import PackedMotion
 from f3amd_lib.ground.names import row_label
-from f3amd_lib.measures.real_clips import STANDING, motion_figures, own_path, sideways_share, style_floor
+from f3amd_lib.measures.real_clips import STANDING, clip_floors, motion_figures, own_path, sideways_share
 from f3amd_lib.measures.registry import METRICS
 from f3amd_lib.measures.walking import CHECKS, walking_figures
 from f3amd_lib.motion.root_paths import RootPath
@@ -31,8 +31,7 @@ def measure_clips(packed: PackedMotion, clips: Sequence[int], *, window: int) ->
     Returns:
       A row a clip, with the columns of `motion_figures`.
     """
-    floors = [style_floor(packed, packed.styles[packed.clip_style[clip]]) for clip in clips]
-    motions = zip(map(packed.motion, clips), floors, strict=True)
+    motions = zip(map(packed.motion, clips), clip_floors(packed, clips), strict=True)
     return pd.DataFrame([motion_figures(motion, own_path(motion), window, floor) for motion, floor in motions])
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from f3amd_lib.data.sources import SPLITS, Dataset, assign_splits, read_clips
 from f3amd_lib.ground import log
-from f3amd_lib.ground.files import whole_folder
+from f3amd_lib.ground.files import check_own_folder, whole_folder
 from f3amd_lib.ground.left_out import leave_out
 from f3amd_lib.ground.names import nearest_hint
 from f3amd_lib.ground.tables import read_text_table
@@ -58,8 +58,7 @@ def write_humanml3d(folder, data: TextMotions) -> Path:
       ValueError: if the folder holds something, two clips have one name, or no clip is for training.
     """
     folder = Path(folder)
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise ValueError(f"{folder}: exists already and is not empty; choose another folder")
+    check_own_folder(folder)
     training = set(data.members("train"))
     if len(set(data.names)) != data.num_clips:
         raise ValueError(f"data set {data.name!r}: two clips have the same name; rename one")
