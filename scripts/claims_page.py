@@ -47,7 +47,7 @@ def _short(statement: Statement | None) -> str:
     """Return what was found of a statement, behind its mark; metrics that miss and models stay in `statement_table`."""
     if statement is None or statement.verdict == judging.UNMEASURED:
         return ""
-    figure = re.sub(r"; not: [^;]*| over \d+ models \(.*?\)| in the range", "", statement.figure)
+    figure = re.sub(r"; not shown: [^;]*| over \d+ models \(.*?\)| in the range", "", statement.figure)
     return f"{MARKS[statement.verdict]} {figure}"
 
 

@@ -632,7 +632,7 @@ def test_networks_that_the_queue_trained_alike_are_shown_and_decide_nothing(tmp_
     assert judgement.verdict == UNJUDGED and judgement.ours[0].figure.startswith("9 of 9")
     # Seeds are averaged, whatever classifier saw them, and two that differ have a wide interval.
     seeds = snapshots(tmp_path / "seeds", [*alike, (FNO, 200_000, "paper", 1, "another", 1.2)])
-    assert f"FID +10 % ({FNO} over" in seeds.ours[0].figure
+    assert f"FID +10 % [-100 %, +137 %] ({FNO} over" in seeds.ours[0].figure
     # Nonsense: one of them is twice as bad, or one of them is missing at this length.
     apart = [*alike[:3], (models[3], 200_000, "paper", 0, "one", 2.0)]
     assert snapshots(tmp_path / "apart", apart).ours[0].figure.startswith("0 of 9")

@@ -2,6 +2,7 @@
 
 import functools
 import json
+import os
 from types import SimpleNamespace
 
 import jax
@@ -112,8 +113,7 @@ def test_styles_go_in_turn(still, tmp_path):
 
     assert styles("default") == ["calm", "proud", "calm", "proud", "calm"]
     assert styles("one", styles=["proud"]) == ["proud"] * 5
-    three = ["proud", "proud", "calm"]
-    assert styles("three", styles=three) == [*three, "proud", "proud"]
+    assert styles("three", styles=["proud", "proud", "calm"]) == ["proud", "proud", "calm", "proud", "proud"]
     still.trained = tiny_trained_with({"proud": still.trained.start_poses["proud"]})
     assert styles("with poses") == ["proud"] * 5
 
@@ -134,8 +134,7 @@ def test_characters_start_in_a_fitting_pose_on_their_path(still, tmp_path):
             np.testing.assert_allclose(history[k, -1, [0, 2]], start, atol=1e-5)
             facing = frame_yaw(SKELETON, history[k, -1].astype(float))
             np.testing.assert_allclose(wrap_angle(facing - yaw[k, 0]), 0.0, atol=1e-5)
-            back = history[k].astype(float)
-            back[:, [0, 2]] -= start
+            (back := history[k].astype(float))[:, [0, 2]] -= start
             back = turn_frames(back, -yaw[k, 0])
             style = still.trained.styles[style_index[k]]
             poses = still.trained.start_poses[style]
@@ -229,9 +228,7 @@ def test_a_stopped_run_goes_on_and_ends_with_the_same_bytes(generator, eleven, t
 
 
 def test_a_finished_crowd_is_replaced_only_if_asked(still, tmp_path):
-    def call(count, **how):
-        return generate_crowd(still, count, 5, tmp_path / "here", chunk=4, **how)
-
+    call = lambda count, **how: generate_crowd(still, count, 5, tmp_path / "here", chunk=4, **how)
     call(9)
     before = content(tmp_path / "here")
     refused("made with another num_characters", call, 6)
@@ -267,11 +264,10 @@ def stop_after(still, chunks):
 
 def test_folders_with_other_things_are_left_alone(still, tmp_path):
     (tmp_path / "thesis.txt").write_text("years of work")
-    for overwrite in (False, True):
-        refused("holds other files", generate_crowd, still, 2, 5, tmp_path, overwrite=overwrite)
-    (tmp_path / "crowd.json").write_text('{"format": "ours", "num_finished": 0}')
-    for overwrite in (False, True):
-        refused(r"crowd.json: not written by this", generate_crowd, still, 2, 5, tmp_path, overwrite=overwrite)
+    for why in ("holds other files", "crowd.json: not written by this"):
+        for overwrite in (False, True):
+            refused(why, generate_crowd, still, 2, 5, tmp_path, overwrite=overwrite)
+        (tmp_path / "crowd.json").write_text('{"format": "ours", "num_finished": 0}')
     refused("thesis.txt: holds other files", generate_crowd, still, 2, 5, tmp_path / "thesis.txt")
     assert sorted(item.name for item in tmp_path.iterdir()) == ["crowd.json", "thesis.txt"]
     assert (tmp_path / "thesis.txt").read_text() == "years of work"
@@ -283,7 +279,7 @@ def test_folders_with_other_things_are_left_alone(still, tmp_path):
         (lambda folder: (folder / "crowd.json").unlink(), "holds no crowd"),
         (lambda folder: edit(folder, drop="offsets"), "crowd.json: description lacks or garbles 'offsets'"),
         (lambda folder: edit(folder, num_frames=6), "crowd.npy: is not a whole array .*not what crowd.json says"),
-        (lambda folder: cut(folder / "crowd.npy"), "crowd.npy: is not a whole array"),
+        (lambda folder: os.truncate(one := folder / "crowd.npy", one.stat().st_size - 1), "npy: is not a whole array"),
     ],
 )
 def test_damaged_and_foreign_crowds_are_refused(still, tmp_path, damage, message):
@@ -299,10 +295,6 @@ def edit(folder, drop=None, **changes):
     (folder / "crowd.json").write_text(json.dumps(settings))
 
 
-def cut(path):
-    path.write_bytes(path.read_bytes()[:-1])
-
-
 def test_all_room_is_taken_when_a_crowd_begins(still, tmp_path):
     # A disk that fills up halfway would kill a process that writes to mapped files.
     with pytest.raises(KeyboardInterrupt):
@@ -311,6 +303,9 @@ def test_all_room_is_taken_when_a_crowd_begins(still, tmp_path):
     assert 512 * begun.st_blocks >= begun.st_size
     generate_crowd(still, 400, 5, tmp_path, chunk=2)
     assert (tmp_path / "crowd.npy").stat().st_size == begun.st_size
+    with pytest.raises(OSError, match="big/crowd.npy: takes .* GB, and .* GB are free"):
+        generate_crowd(still, 10**11, 5, tmp_path / "big")
+    assert not (tmp_path / "big").exists()
 
 
 def test_numbers_that_are_not_finite_stop_the_run_and_name_the_character(still, tmp_path):

@@ -195,8 +195,10 @@ def _list_text(items: Iterable) -> str:
     return ", ".join(f"{item:,}" if isinstance(item, int) else str(item) for item in items)
 
 
-def _change_text(figure: Figure) -> str:
-    return f"{number_text(figure.value)}x" if figure.value >= 2.0 else f"{100.0 * (figure.value - 1.0):+.3g} %"
+def _change_text(figure: Figure, interval: bool = False) -> str:
+    text = lambda one: f"{number_text(one)}x" if figure.value >= 2.0 else f"{100.0 * (one - 1.0):+.3g} %"
+    around = f" [{text(figure.low)}, {text(figure.high)}]" if interval and figure.low < figure.high else ""
+    return text(figure.value) + around
 
 
 # ------------------------------------------------- six kinds that most statements are judged by
@@ -383,8 +385,8 @@ def _by_metric(changes: Mapping[str, Mapping[str, Figure]], bounds=None) -> Find
         largest[metric] = max((apart or some).items(), key=size)
     others = [metric for metric in verdicts if verdicts[metric] != HOLDS]
     told = others or [max(largest, key=lambda metric: size(largest[metric]))]
-    notes = (f"{metric} {_change_text(largest[metric][1])} ({largest[metric][0]})" for metric in told)
-    text = f"{len(verdicts) - len(others)} of {len(verdicts)} metrics; {'not' if others else 'largest change'}: "
+    notes = (f"{metric} {_change_text(largest[metric][1], interval=True)} ({largest[metric][0]})" for metric in told)
+    text = f"{len(verdicts) - len(others)} of {len(verdicts)} metrics; {'not shown' if others else 'largest change'}: "
     return majority(verdicts.values()), text + ", ".join(notes)
 
 
@@ -461,7 +463,7 @@ def every_metric(evidence: Evidence, models, ratio_to, bounds=None, either_way=F
     if least_diversity:
         spread = max(_quality(evidence, one, "diversity") for model in models for one in pair(model))
         if spread.high < least_diversity:
-            return FAILS, f"{text}; noise changes nothing: samples differ by {figure_text(spread)} cm at most"
+            return FAILS, f"{text}; noise changes little: samples differ by {figure_text(spread)} cm at most"
     return verdict, text
 
 

@@ -23,6 +23,7 @@ import functools
 import json
 import math
 import os
+import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -246,6 +247,7 @@ def generate_crowd(
     if min_distance is not None:
         checked_value("min_distance", min_distance, "float")
     out = Path(out)
+    _require_room(out.resolve() / _ROWS, _row_type(settings).itemsize * num_characters)
     with locked(out.resolve().with_name(f".{out.resolve().name}.lock"), f"animating the crowd {out.name}"):
         finished = _num_finished(out, settings, overwrite)
         if finished == 0:
@@ -377,6 +379,14 @@ def _row_type(settings: dict) -> np.dtype:
     frames, joints = settings["num_frames"], len(settings["joints"])
     fields = [("root", "<f4", (frames, 3)), ("rotations", "<f2", (frames, joints, 6)), ("path", "<f4", (frames, 3))]
     return np.dtype([*fields, ("style", "<i4")])
+
+
+def _require_room(path: Path, size: int) -> None:
+    """Raise OSError where a file of this size, bytes, does not fit on the disk; what it replaces makes room."""
+    free = shutil.disk_usage(next(folder for folder in path.parents if folder.exists())).free
+    if size > free + (path.stat().st_size if path.exists() else 0):
+        room = f"takes {size / 1e9:,.3g} GB, and {free / 1e9:,.3g} GB are free on the disk"
+        raise OSError(f"{path}: {room}; ask for fewer characters or frames, or make room")
 
 
 def _lay_out(out: Path, settings: dict) -> None:

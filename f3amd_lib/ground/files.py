@@ -96,7 +96,8 @@ def whole_folder(path) -> Iterator[Path]:
     """Yield a temporary folder beside `path`, which becomes `path` at the end; if the block fails, it is removed.
 
     Args:
-      path: the folder wanted, which must be not there or empty but for hidden files, which are kept; missing folders above it are made.
+      path: the folder wanted, which must be not there or empty but for hidden files, which are kept; missing
+        folders above it are made.
 
     Raises:
       OSError: if something has appeared at `path` meanwhile.
