@@ -460,7 +460,9 @@ def _write_shown(targets, scene, trained) -> None:
             finishing.write_gif(path, motion, target_paths=character.path, titles=[scene.title], **how)
         elif path.suffix == ".mp4":
             gif = path.with_suffix(".gif")
-            subprocess.run(["ffmpeg", "-loglevel", "error", "-y", "-i", gif, "-pix_fmt", "yuv420p", path], check=True)
+            call = ["ffmpeg", "-loglevel", "error", "-y", "-i", gif, "-pix_fmt", "yuv420p", path]
+            if subprocess.run(call, check=False).returncode:
+                raise ValueError(f"{path}: ffmpeg could not make it; ask for --format gif")
         else:
             motion_files.write_motion(path, motion, credit=credit, overwrite=True)
     _say_written(*targets)
@@ -518,8 +520,7 @@ def text(
     if control is not None:
         log.info("control      %s misses its path by %s", joint, far(made.missed))
     shown = player.Character(made.motion, name=name)
-    scene = player.Scene([shown], title=made.motion.name, boundaries=made.boundaries)
-    _write_shown(targets, scene, trained)
+    _write_shown(targets, player.Scene([shown], title=made.motion.name, boundaries=made.boundaries), trained)
 
 
 def _motion_formats(given: str, *more: str) -> list[str]:
@@ -677,9 +678,13 @@ def measure(
     terminal.check_there(published, packed)
     for name in names:
         check_known(name, [*measuring.MEASUREMENTS, *text_tables.TEXT_MEASUREMENTS], "measurement")
+    given = {"text_encoder": captions != Encoder(), "minutes": minutes, "plan": plan, "packed": packed}
+    _only_with("text to motion", not {*names} & {*text_tables.TEXT_MEASUREMENTS}, **given)
+    _only_with("no --minutes, since each call begins with it anew", minutes is not None, model=model)
     if of_text := [name for name in names if name in text_tables.TEXT_MEASUREMENTS]:
         if len(of_text) < len(names):
             raise ValueError(f"{', '.join(of_text)}: measure text to motion in a separate call")
+        _only_with("quality", True, published=published)
         profile, how = motion.numbers(), {"models": model, "stop_at": _stop_at(minutes)}
         clips = text_motions.bandai_text_motions(packed_data.load_packed(packed)) if packed else None
         given = clips or text_models.open_text_motions(motion.data, motion.source), captions.load(), profile
@@ -725,6 +730,8 @@ def campaign(
     """
     stop_at = _stop_at(minutes)
     check_known(queue, long_queue.QUEUES, "queue")
+    _only_with("no --package", package is not None, queue=queue != "campaign")
+    checked_value("--batch-size", batch_size, "int")
     _use_fast_flags(None if times else 1)
     long_queue.check_precision(precision)
     place, table = (long_queue.QUEUES[queue], queue) if package is None else (long_queue.GPU_PLAN, "readings")
@@ -767,6 +774,7 @@ def sweep(
       batch_size: windows a step of the queue's trainings; the paper's is 512.
       out: folder for legs, states and weights of the queue, instead of runs/DATA/PROFILE.
     """
+    checked_value("--workers", workers, "int")
     profile = motion.numbers()
     if motion.window not in (None, profile.window) or motion.people != People():
         raise ValueError("leave out --window and how a folder is read: several processes do not take them")
@@ -885,6 +893,12 @@ def reproduce(
       out: folder of the records instead of runs/; for f3amd of states and weights.
     """
     terminal.check_there(data, evaluator, weights, text_weights)
+    of_text = {"evaluator": evaluator, "weights": weights, "text_encoder": text_encoder, "text_weights": text_weights}
+    _only_with("acmdm or motionpcm", paper == "f3amd", **of_text, repeats=repeats, table=table != "1")
+    of_f3amd = {"reading": reading != "paper", "windows": windows, "batch_size": batch_size != 512}
+    _only_with("f3amd", paper != "f3amd", **of_f3amd, profile=profile != "gpu")
+    for name, count in (("repeats", repeats), ("windows", windows), ("batch-size", batch_size)):
+        checked_value(f"--{name}", count, "int | None")
     if paper == "f3amd":
         motion = Data("100style", profile, str(data))
         long_queue.find_recipe(reading)

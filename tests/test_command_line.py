@@ -137,11 +137,16 @@ def test_a_crowd_that_was_stopped_while_motions_were_written_goes_on(weights, tm
         (["data", "--source", "here"], "--source: only with --data bandai"),
         (["text", "a person walks", "--joint", "head"], "--joint: only with --control"),
         (["text", "a person walks", "--model", "CAMDM"], "no model CAMDM of captions"),
+        (["measure", "quality", "--minutes", "5"], "--minutes: only with text to motion"),
+        (["reproduce", "acmdm", "--data", ".", "--reading", "CAMDM-units"], "--reading: only with f3amd"),
+        (["reproduce", "f3amd", "--data", ".", "--table", "5"], "--table: only with acmdm or motionpcm"),
+        (["campaign", "--batch-size", "0"], "--batch-size must be"),
     ],
 )
 def test_options_that_would_do_nothing_are_refused(weights, tmp_path, capsys, words, says):
     asked = ["--weights", weights] if words[0] in ("rollout", "export") else []
-    assert main([*words, *asked, *(["--out", str(tmp_path / "out")] if words[0] != "data" else [])]) == 2
+    asked += ["--out", str(tmp_path / "out")] if words[0] not in ("data", "measure") else []
+    assert main([*words, *asked]) == 2
     assert says in capsys.readouterr().err
 
 

@@ -12,7 +12,7 @@ from f3amd_companion.measuring import consistency_task
 from f3amd_companion.measuring.consistency_task import ConsistencyTask
 from f3amd_lib.diffusion.schedules import variance_preserving_cosine
 from f3amd_lib.ground.profiles import load_profile
-from f3amd_lib.training.optimise import advance, initial_state
+from f3amd_lib.training.optimise import advance, initial_state, save_state
 from f3amd_lib.training.pipeline import PreparedData
 
 
@@ -84,6 +84,11 @@ def test_a_student_is_asked_in_the_units_of_its_teacher(tmp_path, monkeypatch):
     teacher = dataclasses.replace(teacher, name="F3AMD-FNO-96")
     consistency_task.distil(prepared, profile, teacher, tmp_path, num_steps=2, num_phases=1, batch_size=2)
     assert same_tree(asked[0].denoising.normaliser, own)
+    state = consistency_task.model_files(profile, teacher.name, folder=tmp_path).state
+    save_state(state, asked[0], initial_state(asked[0]))
+    for size, there in ((2, True), (4, False)):  # a state of other settings is set aside
+        consistency_task.distil(prepared, profile, teacher, tmp_path, num_steps=2, num_phases=1, batch_size=size)
+        assert state.exists() is there
 
 
 def test_phases_that_no_sampler_visits_are_refused(task):

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from builders import refused, same_tree
-from compiled import Compiled
 from test_text_judge import OneVectorAWord
 
 from f3amd_companion import __main__ as command_line
@@ -186,41 +185,6 @@ def test_each_stage_sees_training_clips_alone_and_keeps_the_weights_that_are_use
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("finished", [True, False])
-def test_what_an_earlier_version_began_goes_on_by_the_facing_that_it_knows(data, tmp_path, monkeypatch, finished):
-    """Files of earlier versions say nothing of a facing."""
-
-    def loop(task, files, *rest, **leg):
-        tasks.append(task)
-        return types.SimpleNamespace(step=task.config.num_steps, averaged=optimise.initial_state(task).params), []
-
-    tasks, files = [], text_models.text_model_files(PROFILE, "tiny-VAE", folder=tmp_path)
-    monkeypatch.setattr(train_stage, "train_in_legs", loop)
-    train = partial(train_stage.train_stage, data, OneVectorAWord(), PROFILE, folder=tmp_path, **QUIET)
-    to_dict = presets.find_family("latent autoencoder")[0].to_dict
-    with monkeypatch.context() as patch:
-        patch.setitem(presets.PRESETS, "tiny-VAE", dataclasses.replace(TINY["tiny-VAE"], network=SIZES))
-        without = lambda config: {name: value for name, value in to_dict(config).items() if name != "released_facing"}
-        patch.setattr(presets.find_family("latent autoencoder")[0], "to_dict", without)
-        train("tiny-VAE")
-        if not finished:
-            optimise.save_state(files.state, tasks[0], optimise.initial_state(tasks[0]))
-            files.model.unlink()
-    train("tiny-teacher")
-    earlier, teacher = tasks[0], tasks[-1]
-    np.testing.assert_allclose(earlier.statistics.mean, frame_statistics(data, False).mean, atol=1e-6)
-    assert np.abs(earlier.statistics.mean - frame_statistics(data).mean).max() > 1e-4
-    assert len(tasks) == (2 if finished else 3) and teacher.name == "latent teacher"
-    if not finished:
-        assert int(optimise.restore_state(files.state, tasks[1]).step) == 0
-        assert np.array_equal(tasks[1].clips.frames, earlier.clips.frames)
-    assert not text_models.load_text_model(files.model).autoencoder.released_facing
-    vectors = earlier.statistics.normalise(data.select([0]).redundant_vectors(released=False))
-    coder = Compiled(network_with(earlier.model_config, text_models.load_text_model(files.model).autoencoder_params))
-    seen = coder.encode(np.pad(vectors, ((0, 56), (0, 0)))[None], np.arange(96)[None] < 40)[0]
-    np.testing.assert_allclose(teacher.clips.mean[0], seen[0], atol=1e-4)
-
-
 def test_a_teacher_is_guided_away_from_what_its_encoder_makes_of_no_words(data, tmp_path, monkeypatch):
     def loop(task, *rest, **leg):
         return types.SimpleNamespace(step=task.config.num_steps, averaged=optimise.initial_state(task).params), []

@@ -92,11 +92,13 @@ def test_fewer_bits_are_smaller_and_cost_what_is_measured(folder, trained):
 
 
 @needs_onnx
-def test_what_cannot_be_exported_is_told(trained, folder, monkeypatch):
+def test_what_cannot_be_exported_is_told(trained, folder, monkeypatch, tmp_path):
     network = trained.network()
     refused("unknown weights 'int4'", onnx_export.denoiser_program, network, weights="int4")
     refused("at least 1 character", onnx_export.denoiser_program, network, batch=0)
     refused("pass --overwrite", onnx_export.export_onnx, trained, folder)
+    (tmp_path / "example.py").write_text("mine")
+    refused("example.py: exists already", onnx_export.export_onnx, trained, tmp_path)
     monkeypatch.setitem(sys.modules, "jax2onnx", None)
     with pytest.raises(ImportError, match="make onnx-tools"):
         onnx_export.denoiser_program(network)

@@ -68,6 +68,10 @@ def test_what_changed_or_is_asked_for_is_measured_again_in_its_place(run):
     assert record["weights_digests"] == {"b": ["aa"], "a": ["cc"]}
     assert run([row("a", 8, "cc"), row("b", 8)], again=["b"])[0] == [("b", 8)]
     assert len(read_table(records.path("figures"))[0]) == 4
+    run([row("b, leading", 8)])
+    assert run([row("b, leading", 8)], again=["b"])[0] == [("b, leading", 8)]  # a way to ask b
+    (summary := records.path("summary")).unlink()  # as if killed before it was written
+    assert run([row("b, leading", 8)])[0] == [] and len(read_table(summary)[0]) == 3
 
 
 def test_a_stopped_run_goes_on_and_other_settings_start_anew(run, tmp_path):

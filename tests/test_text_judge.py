@@ -92,6 +92,9 @@ def test_two_processes_do_not_train_one_judge(data, tmp_path, cache_dir):
     with alone_with(files):
         refused("training judge", text_judge.train_judge, data, OneVectorAWord(), **again)
     assert text_judge.train_judge(data, OneVectorAWord(), **again) and files.model.exists()
+    assert text_judge.train_judge(data, OneVectorAWord(), **again)  # read
+    few = data.select(data.members("train"))
+    refused("is a judge of other data", text_judge.train_judge, few, OneVectorAWord(), **again)
 
 
 def test_a_table_has_real_motion_first_and_every_figure_with_its_interval(judge, data, cache_dir):

@@ -5,6 +5,7 @@ import types
 
 import numpy as np
 import pytest
+from builders import refused
 from test_text_judge import OneVectorAWord
 
 from f3amd_companion.measuring import text_tables
@@ -70,6 +71,9 @@ def test_each_probe_is_wrong_in_the_way_it_says(data):
         again = system(0)
         assert told == again[1] and all(np.array_equal(*pair) for pair in zip(motions, again[0], strict=True))
         assert list(told) != list(system(1)[1])
+    alone = dataclasses.replace(real, pairs=tuple(real.names))  # as HumanML3D's, which share none
+    assert sorted({*probes} - {*probes_of(alone, others, seed=0)}) == ["other real clips"]
+    refused("none of the contents of bandai", measure_hands, alone, OneVectorAWord(), PROFILE)
     shown = {name: system(0)[0] for name, system in probes.items()}
     trains = [others.clip(k) for k in range(others.num_clips)]
     assert all(any(np.array_equal(motion, clip) for clip in trains) for motion in shown["other real clips"])

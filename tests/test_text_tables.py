@@ -72,6 +72,14 @@ def tables(data, tmp_path_factory):
         yield made
 
 
+def test_many_motions_are_drawn_in_parts_each_with_noise_of_its_own(monkeypatch):
+    monkeypatch.setattr(text_tables, "_AT_ONCE", 2)
+    asked, key = [], jax.random.key(0)
+    draw = lambda rows, key: asked.append(len(rows)) or rows + jax.random.uniform(key)
+    made = text_tables._drawn_in_parts(draw, key, np.zeros(5))
+    assert asked == [2, 2, 2] and len(set(made.round(5).tolist())) == 3 and made[0] == draw(np.zeros(2), key)[0]
+
+
 @pytest.mark.long
 def test_every_table_has_the_columns_that_the_ledger_reads(tables):
     for name, table in tables.items():

@@ -147,8 +147,7 @@ def _read_models(value, families: Mapping, where: str) -> dict | list[dict]:
         return {key: list(map(member, names)) for key, names in family.items()}
     check_entry(value, where, ("model", "window", "steps"), ("framework",))
     check_model(value["model"], where)
-    row = {"model": value.pop("model"), "window_frames": value.pop("window"), "steps": value.pop("steps")}
-    return row | value
+    return {"model": value.pop("model"), "window_frames": value.pop("window"), "steps": value.pop("steps")} | value
 
 
 def _read_statement(entry: Mapping, about: Mapping, where: str) -> Statement:

@@ -84,8 +84,7 @@ def checked_table(name: str, table: pd.DataFrame, where: str, others: Sequence[s
     }
     if name == "quality" and "unit" in table:
         wanted = table["metric"].map({metric: unit for metric, (unit, _) in NINE_METRICS.items()})
-        unlike = wanted.notna() & (table["unit"].astype(object).fillna("") != wanted)
-        faults["another unit than the paper"] = unlike
+        faults["another unit than the paper"] = wanted.notna() & (table["unit"].astype(object).fillna("") != wanted)
     for fault, rows in faults.items():
         if rows.any():
             raise ValueError(f"{where}: has {fault} of {', '.join(map(str, table.loc[rows, keys].iloc[0]))}")

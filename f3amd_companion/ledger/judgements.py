@@ -249,8 +249,7 @@ def _counted(evidence: Evidence, judge: Callable, between: str, table, metric, r
     verdicts = {judge([one, *others]) for one in firsts}
     by_points = "".join(f" ({number_text(one.value)} if by points)" for one in firsts[1:])
     values = ", ".join(number_text(other.value) for other in others)
-    text = f"{number_text(first.value)}{by_points}{between}{values}"
-    return verdicts.pop() if len(verdicts) == 1 else OPEN, text
+    return verdicts.pop() if len(verdicts) == 1 else OPEN, f"{number_text(first.value)}{by_points}{between}{values}"
 
 
 def _measured(models: Mapping | list, look: Callable[[Mapping], object]) -> list[Mapping]:
@@ -417,8 +416,7 @@ def metric_spread(evidence: Evidence, models, metric, bounds) -> Finding:
     models = _measured(models, lambda model: _quality(evidence, model, metric))
     spread, largest, least = _spread(models, [_quality(evidence, model, metric) for model in models])
     percent = figure_text(spread.map(lambda bound: 100.0 * (bound - 1.0)))
-    text = f"{percent} % over {len(models)} models ({least} to {largest})"
-    return within(spread, bounds), text
+    return within(spread, bounds), f"{percent} % over {len(models)} models ({least} to {largest})"
 
 
 def best_of(evidence: Evidence, model, models, metric) -> Finding:

@@ -36,8 +36,7 @@ def ve_is_vp(_) -> Finding:
     x0, noise = rng.standard_normal((2, len(sigma), 16))
     alpha_bar = schedules.alpha_bar_from_sigma(sigma)
     carried = np.sqrt(alpha_bar) * samplers.add_noise(x0, sigma, noise)
-    preserving = np.sqrt(alpha_bar) * x0 + np.sqrt(1.0 - alpha_bar) * noise
-    return _agreement(float(np.abs(carried - preserving).max()))
+    return _agreement(float(np.abs(carried - (np.sqrt(alpha_bar) * x0 + np.sqrt(1.0 - alpha_bar) * noise)).max()))
 
 
 def _rescaled(x, x0_hat, sigma, sigma_next):
@@ -71,8 +70,7 @@ def reaches_data(_, update) -> Finding:
 
 def _operations(block: type, frames: int, width: int, *sizes) -> int:
     """Count the operations of a block on one window, without building its weights."""
-    built = nnx.eval_shape(lambda: block(*sizes, rngs=LayerKeys(jax.random.key(0))))
-    graph, state = nnx.split(built)
+    graph, state = nnx.split(nnx.eval_shape(lambda: block(*sizes, rngs=LayerKeys(jax.random.key(0)))))
     window = jax.ShapeDtypeStruct((1, frames, width), jnp.float32)
     return count_flops(lambda state, z: nnx.merge(graph, state)(z), state, window)
 
@@ -81,8 +79,7 @@ def _fit_terms(counts: Sequence[int], terms: Sequence[Sequence[float]]) -> tuple
     """Fit counts by multiples of terms; return them, and whether they fit."""
     scaled = np.asarray(terms, dtype=np.float64) / np.asarray(counts, dtype=np.float64)[:, None]
     factors = np.linalg.lstsq(scaled, np.ones(len(counts)), rcond=None)[0]
-    error = np.abs(scaled @ factors - 1.0).max()
-    return factors, HOLDS if error < 1e-9 else FAILS
+    return factors, HOLDS if np.abs(scaled @ factors - 1.0).max() < 1e-9 else FAILS
 
 
 def attention_cost(_) -> Finding:

@@ -58,7 +58,7 @@ from f3amd_lib.papers.printed import SCHEMAS, printed_tables
 from f3amd_lib.rollout.rollout import MotionGenerator
 from f3amd_lib.training.checkpoints import TrainedModel, load_model, save_model
 from f3amd_lib.training.denoising_task import DenoisingTask
-from f3amd_lib.training.optimise import held_out_terms, restore_state
+from f3amd_lib.training.optimise import differences, held_out_terms, restore_state
 from f3amd_lib.training.pipeline import ModelFiles, PreparedData, as_trained, set_aside_run, train_in_legs
 from f3amd_lib.training.recipe import TrainingConfig, paper_recipe
 
@@ -348,12 +348,16 @@ def _trained(
     files, held_out = ModelFiles.of(file.parent, run.preset), data.windows(data.held_out_split)
     reached = int(restore_state(files.state, task).step) if files.state.exists() else 0
     # A leg that was killed before it was measured has the state still, which is not rounded as the kept weights are.
-    if file.exists() and reached != steps and (found := load_model(file)).record["training"] == config.to_dict():
+    if file.exists() and reached != steps:
+        found = load_model(file)
+        if unlike := differences({"training": config.to_dict()}, found.record):
+            raise ValueError(f"{file}: was trained with other {'; '.join(unlike)}; ask for those, or another --out")
         kept = SimpleNamespace(averaged=found.params, statistics=None)
         return data, found, held_out_terms(task, kept, held_out)["loss"], config
     if reached > steps:
         set_aside_run(files)
-    record, every = {**record, "training": config.to_dict()}, min(steps, _EVERY.get(device_name(), 1000))
+    record = {**record, "training": config.to_dict(), "precision": precision}
+    every = min(steps, _EVERY.get(device_name(), 1000))
     with matmul_precision(precision):
         leg = {"stop_after": steps, "stop_at": stop_at, "progress": progress}
         state, _ = train_in_legs(task, files, record, held_out=held_out, every=every, **leg)
@@ -386,7 +390,7 @@ def _measured(prepared, classifier, protocol, run: Run, windows: int, table: str
         "epochs": seen / data.windows("train").num_windows, "weights": weights_digest(trained.params),
         "classifier": weights_digest(classifier.params),
         # Where it was trained, which may be elsewhere.
-        "device": trained.record["device_kind"], "precision": how["precision"],
+        "device": trained.record["device_kind"], "precision": trained.record.get("precision", how["precision"]),
         "commit": (trained.record["git_commit"] or "")[:10],
     }  # fmt: skip
     return pd.concat([rows, use, of_windows]).assign(**columns)

@@ -17,12 +17,12 @@ import pandas as pd
 from f3amd_lib.data.windows import spread_windows
 from f3amd_lib.diffusion.samplers import add_noise
 from f3amd_lib.ground.profiles import Profile
-from f3amd_lib.ground.trees import weights_digest
+from f3amd_lib.ground.trees import describe, weights_digest
 from f3amd_lib.text.phases import consistency_answer
 from f3amd_lib.training.checkpoints import TrainedModel, network_with
 from f3amd_lib.training.denoising_task import DenoisingTask, network_inputs
-from f3amd_lib.training.optimise import Task, TrainingState, frozen_tree
-from f3amd_lib.training.pipeline import PreparedData, model_files, train_and_keep
+from f3amd_lib.training.optimise import Task, TrainingState, differences, frozen_tree
+from f3amd_lib.training.pipeline import PreparedData, model_files, set_aside_run, train_and_keep
 from f3amd_lib.training.recipe import paper_recipe
 
 TEACHER_STEPS = 8
@@ -132,12 +132,14 @@ def distil(
       (student, history); the student is None where `stop_at` came first.
 
     Raises:
-      ValueError: if a training state of other settings lies there, or for phases that the task refuses.
+      ValueError: for phases that the task refuses. A state of other settings or another teacher is set aside.
     """
     settings = {"batch_size": batch_size, "learning_rate": learning_rate, "ema_decay": ema_decay, "seed": profile.seed}
     config = paper_recipe(teacher.name, num_steps, schedule="warmup_cosine", warmup_steps=20, **settings)
     denoising = prepared.task(teacher.name, config, normaliser=teacher.normaliser)
     task = ConsistencyTask(denoising, teacher.params, num_phases=num_phases)
     files = model_files(profile, teacher.name, folder=Path(folder))
+    if files.state.exists() and differences(task.identity(), describe(files.state)):
+        set_aside_run(files)
     about = {"distilled_from": weights_digest(teacher.params), "num_phases": num_phases}
     return train_and_keep(prepared, profile, teacher.name, task, files, about, **leg)

@@ -27,7 +27,7 @@ import pandas as pd
 from f3amd_companion.measuring import sensitivity
 from f3amd_companion.measuring.consistency_task import STUDENT_SPACING, TEACHER_STEPS, distil
 from f3amd_companion.measuring.runner import Records, record_of, records_folder
-from f3amd_companion.measuring.times import Candidate, time_group
+from f3amd_companion.measuring.times import Candidate, time_group, timed_record
 from f3amd_companion.serving.foot_locking import lock_rollout
 from f3amd_lib.data.packed import PackedMotion
 from f3amd_lib.data.windows import WindowSet, spread_windows
@@ -381,8 +381,7 @@ def measure_gradient_norm(prepared: PreparedData, profile: Profile, models: Iter
     def slope(row: Mapping) -> dict:
         model, recipe = trained[row["model"]], profile_recipe(profile, row["model"])
         task = prepared.task(model.name, recipe, normaliser=model.normaliser)
-        levels = gradient_norm_by_sigma(task, model.params, held_out, SIGMAS, seed=profile.seed)
-        return {"gradient_norm": levels}
+        return {"gradient_norm": gradient_norm_by_sigma(task, model.params, held_out, SIGMAS, seed=profile.seed)}
 
     record = record_of(profile, prepared.packed, "gradient_norm", sigmas=SIGMAS)
     todo = [{"model": name} for name in trained]
@@ -442,10 +441,8 @@ def measure_round_times(prepared: PreparedData, profile: Profile, models: Iterab
     called = {"value": "milliseconds", "median_low": "milliseconds_low", "median_high": "milliseconds_high"}
     keys = ["model", "steps", "characters"]
     table = times[[*keys, *called]].rename(columns=called).assign(weights=times["model"].map(_digests(trained)))
-    record = record_of(profile, prepared.packed, "round_times", characters=_TIMED_CHARACTERS)
-    records = Records(records_folder(profile), record, {"round_times": keys})
-    records.put("round_times", {}, table)
-    return records.path("round_times")
+    record = timed_record(prepared, profile, "round_times", characters=_TIMED_CHARACTERS)
+    return write_table(records_folder(profile) / "round_times.csv", table, record)
 
 
 MEASUREMENTS: dict[str, Callable] = {

@@ -106,8 +106,7 @@ class PaperBench(Bench):
 
     def shown(self) -> list[np.ndarray]:
         """Return what the judge sees of the real clips."""
-        rows = self.real.redundant_vectors() if self.vectors else self.real.positions
-        return np.split(rows, self.real.start[1:-1])
+        return np.split(self.real.redundant_vectors() if self.vectors else self.real.positions, self.real.start[1:-1])
 
     def embed(self, motions) -> np.ndarray:
         """Return vectors [L, C] as they are, or positions [L, J, 3], of which the released code makes L - 1 vectors."""
@@ -186,8 +185,7 @@ def beside_paper(printed: pd.DataFrame, measured: pd.DataFrame, keys: list[str])
     both = [table.reindex(columns=[*keys, *columns]).rename(columns=named[whose])
             for whose, table in zip(named, (printed, measured), strict=True)]  # fmt: skip
     table = both[0].merge(both[1], on=keys, how="left")
-    figures = [table[list(names.values())].to_numpy(float) for names in named.values()]
-    table["verdict"] = list(map(verdict, *figures))
+    table["verdict"] = list(map(verdict, *[table[list(names.values())].to_numpy(float) for names in named.values()]))
     table["yours / paper"] = table["yours: value"] / table["paper: value"]
     return table.assign(verdict=table["verdict"].mask(table["metric"] == "sampling_seconds", "of a device"))
 
@@ -293,6 +291,7 @@ def reproduce_table(
         raise ValueError(NO_MESHES)
     data = read_humanml3d(given.data)
     layout = "kit" if data.skeleton.num_joints == 21 else "humanml3d"
+    out = out / layout
     if (layout == "kit") != (name == "text_tableA3") and paper == "acmdm":
         raise ValueError(f"{given.data}: has the layout {layout}; Table A3 needs KIT-ML, the others HumanML3D")
     settings = load_paper_file("experiments", "acmdm")["settings"]["paper"] | ({"repeats": repeats} if repeats else {})
@@ -306,7 +305,8 @@ def reproduce_table(
     clip = evaluator_in(given.evaluator, CLIP_EVALUATOR, given.data, test, layout) if extra else None
     record = run_record(
         profile="paper", dataset=data, seed=seed, measurement=f"{paper} {name}", settings=settings,
-        judge_weights=weights_digest(judge.params), clip_weights=weights_digest(clip[0].params) if clip else "",
+        judge_weights=weights_digest([judge.params, judge.normaliser]), judge_encoder=judge.text_encoder,
+        text_encoder=given.text_encoder or ENCODERS[paper], clip_weights=weights_digest(clip[0].params) if clip else "",
     )  # fmt: skip
     bench = PaperBench(judge, None, test, settings, seed, heard, clip=clip)
     of_data = lambda table: table[table["dataset"] == DATASETS[layout]] if "dataset" in table else table
@@ -320,8 +320,7 @@ def reproduce_table(
     if rows and about["kind"] != "reconstruction":
         encoder = load_text_encoder(given.text_encoder or ENCODERS[paper], given.text_weights)
         captions = captions_of(test)
-        pooled = looked_up(captions, embed_captions(captions, encoder).pooled)
-        bench = replace(bench, encoder=encoder, pooled=pooled)
+        bench = replace(bench, encoder=encoder, pooled=looked_up(captions, embed_captions(captions, encoder).pooled))
     tables = dict.fromkeys((name, *about.get("beside", ())), [key for key in keys if key != "joint"])
     records = Records(out, record, tables)
     find = lambda preset: model_in(given.weights, preset, bench.encoder, layout)

@@ -10,6 +10,7 @@ from pathlib import Path
 import pandas as pd
 
 from f3amd_lib.ground import log
+from f3amd_lib.ground.names import asked_network
 from f3amd_lib.ground.profiles import Profile, results_dir
 from f3amd_lib.ground.records import read_table, record_hash, run_record, set_aside_table, whole_table, write_table
 
@@ -89,7 +90,7 @@ class Records:
     def has(self, name: str, row: Mapping) -> bool:
         """Tell whether a table has rows of this name that agree in all columns of `row`, weights among them."""
         tables = [rows for rows in (self.tables[name], self.known.get(name)) if rows is not None and {*row} <= {*rows}]
-        return row.get("model") not in self.again and any(
+        return asked_network(str(row.get("model"))) not in self.again and any(
             (rows[list(row)] == list(row.values())).all(axis=1).any() for rows in tables
         )
 
@@ -109,7 +110,8 @@ class Records:
         """Write a table; its record names the weights of the table that it was made from, itself or another."""
         digests = {}
         if "weights" in self.tables[source]:
-            used = self.tables[source].groupby(self.keys[source][0], sort=False)["weights"].unique()
+            by = "model" if "model" in self.tables[source] and "run" not in self.keys[source] else self.keys[source][0]
+            used = self.tables[source].groupby(by, sort=False)["weights"].unique()
             digests = used.map(list).to_dict()
         write_table(self.path(name), rows, self.record | {"weights_digests": digests})
 
@@ -128,4 +130,8 @@ class Records:
             log.info("%s, %d of %d: %s", into, number, len(todo), named)
             for name, rows in measure(row).items():
                 self.put(name, row, rows)
+        for summary, (table, summarise) in self.summaries.items():
+            rows, there = self.tables[table], kept_rows(self.path(summary), self.record)
+            if rows is not None and (there is None or len(there) < len(summarise(rows))):  # a run was killed before it
+                self._write(summary, summarise(rows), table)
         return self.path(next(iter(self.summaries), into))

@@ -143,8 +143,7 @@ def _toe_power(motion: Motion) -> dict[str, float]:
 
     In (m/s)^2: mean over toes, sum over x, y, z.
     """
-    toes = motion.positions[:, list(motion.skeleton.toes)]
-    velocity = motion.fps * np.diff(toes, axis=0)
+    velocity = motion.fps * np.diff(motion.positions[:, list(motion.skeleton.toes)], axis=0)
     frequency, density = welch(velocity, motion.fps, nperseg=_SEGMENT, axis=0, detrend="constant")
     density = density.sum(axis=-1).mean(axis=-1)
     width = frequency[1] - frequency[0]
@@ -189,8 +188,7 @@ def foot_spectrum(systems: Mapping[tuple[str, int, int], Sequence[tuple[str, Mot
     power = power.join(real, on=["style", "band"])
     for style in power.loc[power["real"].isna(), "style"]:
         raise ValueError(f"no real clip of style {style!r} is long enough to compare with")
-    quotient = power.assign(value=np.log(power["value"] / power["real"]))
-    tables = {"toe_power": power, "toe_power_over_real": quotient}
+    tables = {"toe_power": power, "toe_power_over_real": power.assign(value=np.log(power["value"] / power["real"]))}
     tables = {name: distributions.intervals_over_repeats(one, [*keys, "band"]) for name, one in tables.items()}
     bounds = ["value", "low", "high"]
     tables["toe_power_over_real"][bounds] = np.exp(tables["toe_power_over_real"][bounds])

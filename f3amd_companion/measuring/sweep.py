@@ -40,7 +40,7 @@ from f3amd_lib.training.pipeline import PreparedData, model_files, obtain_model,
 CAMPAIGN, TRAIN = "campaign", "train"
 """Legs that are no measurement of `measure`: a snapshot of the queue, and the training of a preset."""
 
-NOT_BY_PRESET = ("sensitivity",)
+NOT_BY_PRESET = ("sensitivity", "round_times")
 """Measurements whose table is not one of trained presets side by side."""
 
 CONNECT_S = 10

@@ -177,13 +177,13 @@ _AT_ONCE = 256
 def in_parts(draw: Callable) -> Callable:
     """Return `draw(pooled, mask, key)`, asked for parts of one shape where there are more than `_AT_ONCE` motions."""
 
-    def parts(pooled, mask, key, control=None):
-        if len(mask) <= _AT_ONCE:
-            return draw(pooled, mask, key)
-        part = lambda rows: draw(pooled[rows], mask[rows], jax.random.fold_in(key, rows[0]))
-        return in_batches(part, len(mask), _AT_ONCE)
+    return lambda pooled, mask, key, control=None: _drawn_in_parts(draw, key, pooled, mask)
 
-    return parts
+
+def _drawn_in_parts(draw: Callable, key, *arrays):
+    """Return what `draw(*arrays, key)` makes, asked for at most `_AT_ONCE` rows of the arrays at a time."""
+    part = lambda rows: draw(*(one[rows] for one in arrays), jax.random.fold_in(key, rows[0]) if rows[0] else key)
+    return in_batches(part, len(arrays[0]), min(_AT_ONCE, len(arrays[0])))
 
 
 def whole_rows(bench: Bench, trained: TextModel, row: Mapping, about: Mapping, first: TextModel | None) -> pd.DataFrame:
@@ -220,9 +220,7 @@ def prefix_drawer(trained: TextModel, most_frames: int, num_steps: int | None) -
         state = jnp.concatenate([prefix, *parts], axis=1)
         return codec.decode(state, jnp.ones((len(state), state.shape[1] * codec.frames_per_state), bool))
 
-    return lambda starts, pooled, key: codec.axes.restore(
-        np.asarray(draw(jnp.asarray(starts), jnp.asarray(pooled), key))
-    )
+    return lambda *given: codec.axes.restore(_drawn_in_parts(draw, given[-1], *map(jnp.asarray, given[:-1])))
 
 
 def autoregressive_rows(bench: Bench, trained: TextModel, row: Mapping, about: Mapping, first) -> pd.DataFrame:
@@ -232,7 +230,7 @@ def autoregressive_rows(bench: Bench, trained: TextModel, row: Mapping, about: M
     count = next(iter(trained.starts.values())).shape[0] * trained.codec.frames_per_state
     true = np.asarray(pad_motions([bench.real.clip(k)[:count] for k in range(bench.real.num_clips)], count).motion)
     draw = prefix_drawer(trained, int(bench.real.lengths.max()), bench.num_steps(trained))
-    begin = None if first is None else motion_drawer(first, num_steps=bench.num_steps(first))
+    begin = None if first is None else in_parts(motion_drawer(first, num_steps=bench.num_steps(first)))
 
     def make(pooled, lengths, key):
         if begin is None:
@@ -301,16 +299,17 @@ def control_drawer(bench: Bench, trained: TextModel, section: str, clips, pooled
     """
     codec, config = trained.codec, trained.config
     batch = pad_motions([bench.real.clip(clip) for clip in clips], int(bench.real.lengths[clips].max()))
-    condition = TextCondition(jnp.asarray(pooled), codec.state_mask(batch.mask))
-    wanted = jnp.asarray(codec.axes.normalise(batch.motion))
-    states = _controlled_states(bench, trained, section, condition, batch.mask)
+    given = jnp.asarray(pooled), batch.mask, jnp.asarray(codec.axes.normalise(batch.motion))
 
     @jax.jit
-    def draw(asked, key):
+    def draw(pooled, mask, wanted, asked, key):
+        condition = TextCondition(pooled, codec.state_mask(mask))
         noise = jax.random.normal(key, (*condition.mask.shape, config.num_joints, config.channels))
-        return codec.decode(states(noise, Control.of(wanted, asked)), batch.mask)
+        states = _controlled_states(bench, trained, section, condition, mask)
+        return codec.decode(states(noise, Control.of(wanted, asked)), mask)
 
-    return lambda asked, key: codec.axes.restore(np.asarray(draw(jnp.asarray(asked), key))), np.asarray(batch.motion)
+    parts = lambda asked, key: codec.axes.restore(_drawn_in_parts(draw, key, *given, jnp.asarray(asked)))
+    return parts, np.asarray(batch.motion)
 
 
 def control_rows(bench: Bench, trained: TextModel, row: Mapping, about: Mapping, first) -> dict[str, pd.DataFrame]:
@@ -357,7 +356,8 @@ def control_rows(bench: Bench, trained: TextModel, row: Mapping, about: Mapping,
     seconds = median_seconds(lambda number: draw(asked, jax.random.fold_in(key, number)), 5)
     taken = {"joint": each["joint"].iloc[-1], "metric": "sampling_seconds", "value": seconds}
     means = each.groupby(["joint", "metric"], sort=False)["value"].mean().reset_index()
-    return {"text_table3": pd.concat([means, pd.DataFrame([taken])]), "text_control": each}
+    # The first table says what was measured, so it is written last.
+    return {"text_control": each, "text_table3": pd.concat([means, pd.DataFrame([taken])])}
 
 
 def median_seconds(ask: Callable, count: int) -> float:
@@ -520,16 +520,16 @@ def measure_text_table(
       The table, `records/<name>.csv`; None where the time was over first.
     """
     about = EXPERIMENTS[name]
-    asked, bench = list(models or ()), bench_of(data, encoder, profile, folder=folder, plan=plan, **leg)
+    asked, rows = list(models or ()), [dict(row) for row in (about["rows"] if rows is None else rows)]
+    for model in asked:
+        check_known(model, [row["model"] for row in rows], f"model of {name}")
+    bench = bench_of(data, encoder, profile, folder=folder, plan=plan, **leg)
     if bench is None:
         return None
     settings, record = bench.settings, bench.record(profile, data, name)
     # ACMDM's models of a table are all trained alike, and briefly, apart from those that `f3amd text` is to find.
     apart = folder or runs_dir(profile.dataset, profile.name) / (f"text_{plan}" if plan else "text_tables")
     cut, most_frames = data.cut(settings["most_frames"]), settings["most_frames"]
-    rows = [dict(row) for row in (about["rows"] if rows is None else rows)]
-    for model in asked:
-        check_known(model, [row["model"] for row in rows], f"model of {name}")
     keys = [column for column in rows[0] if column not in ("trained", "first")] + ["seed", "length"] * bool(plan)
     tables = dict.fromkeys((name, *about.get("beside", ())), keys)
     records = Records(records_folder(profile), record, tables, again=asked)
@@ -692,8 +692,8 @@ def probes_of(real: TextMotions, others: TextMotions, seed: int) -> dict:
     def changed(change: Callable) -> Callable:
         return lambda repeat: (list(map(change, clips)), told(repeat))
 
-    return {
-        "other real clips": others_shown,
+    shown = {"other real clips": others_shown} if all(map(len, of_pair.values())) else {}
+    return shown | {
         "captions of other clips": lambda repeat: (clips, list(drawn(repeat).permutation(told(repeat)))),
         "left and right exchanged": changed(partial(mirrored_positions, real.skeleton)),
         "backwards in time": changed(lambda clip: clip[::-1]),
@@ -777,6 +777,8 @@ def measure_hands(
       The table, `records/hands.csv`: a row per model, content, side and caption.
     """
     asked = list(models or ())
+    if not {content for content, _ in HAND_CONTENTS} & {pair.partition(",")[0] for pair in data.pairs}:
+        raise ValueError(f"data set {data.name!r} has none of the contents of bandai that name a hand: leave hands out")
     told = {"text_encoder": encoder.identity, "frames": HAND_FRAMES, "raised_from": text_metrics.RAISED}
     record = record_of(profile, data, "hands", **told)
     records = Records(records_folder(profile), record, {"hands": ["model"]}, again=asked)

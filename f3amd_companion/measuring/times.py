@@ -54,7 +54,7 @@ _TRAINING = {"smoke": (4, 2, 8), "laptop": (200, 10, 64), "gpu": (200, 20, 512)}
 """Training steps to time, steps in one program, windows in a batch."""
 
 
-def _record(prepared: PreparedData, profile: Profile, measurement: str, **extra) -> dict:
+def timed_record(prepared: PreparedData, profile: Profile, measurement: str, **extra) -> dict:
     """Return a record that tells the machine; another machine's rows do not belong in its table."""
     machine = describe_machine()
     lasting = {name: machine[name] for name in ("processor", "cores", "system")}
@@ -187,7 +187,7 @@ def measure_synthesis_time(
     if never := {*(characters or counts)} - counts:
         raise ValueError(f"no group of {min(never)} characters in {', '.join(suites)}: there are {sorted(counts)}")
     turns = {"fewest_rounds": 3, **_TURNS.get(profile.name, {})}
-    record = _record(prepared, profile, "synthesis_time", turns=turns)
+    record = timed_record(prepared, profile, "synthesis_time", turns=turns)
     keys = ["suite", *(field.name for field in dataclasses.fields(Candidate))]
     summaries = {"synthesis_time": ("synthesis_ways", fastest_implementations)}
     records = Records(records_folder(profile), record, {"synthesis_ways": keys}, summaries=summaries)
@@ -241,7 +241,7 @@ def measure_training_time(
       as of `time_group`, epoch_minutes, and peak_memory_mib as the compiler plans it. None where `stop_at` came first.
     """
     steps, chunk, batch_size = _TRAINING[profile.name]
-    record = _record(prepared, profile, "training_time", steps=steps, chunk=chunk)
+    record = timed_record(prepared, profile, "training_time", steps=steps, chunk=chunk)
     keys, again = ["model", "window_frames", "device", "batch_size"], _TRAINED if again else ()
     records = Records(records_folder(profile), record, {"training_time": keys}, again=again)
     named = [dict(zip(keys, (name, prepared.window, device_name(), batch_size), strict=True)) for name in _TRAINED]
@@ -353,7 +353,7 @@ def measure_round_parts(prepared: PreparedData, profile: Profile) -> Path:
     """
     config, turns = prepared.model_config("F3AMD-FNO-96"), {"progress": True, **_TURNS.get(profile.name, {})}
     tables = [time_breakdown(Workload("F3AMD-FNO-96", config, 1, characters), **turns) for characters in (1, 32)]
-    record = _record(prepared, profile, "round_parts", **_circumstances())
+    record = timed_record(prepared, profile, "round_parts", **_circumstances())
     return write_table(records_folder(profile) / "round_parts.csv", pd.concat(tables), record)
 
 

@@ -185,8 +185,7 @@ def _load_jax(folder: Path, manifest: dict) -> tuple[Callable, Callable]:
     try:
         exported = export.deserialize(blob)
     except Exception as error:  # JAX promises no type
-        made_by = manifest["record"]["versions"]["jax"]
-        what = f"JAX {jax.__version__} cannot read what JAX {made_by} exported ({error})"
+        what = f"JAX {jax.__version__} cannot read what JAX {manifest['record']['versions']['jax']} exported ({error})"
         raise ValueError(f"{folder / JAX_EXPORT}: {what}; install that version, or export again") from None
     # Compiled ahead of the first call, so that a call does nothing but run.
     compiled = jax.jit(exported.call).lower(*exported.in_avals).compile()

@@ -97,8 +97,7 @@ def crowd_paths(characters: range, pace: np.ndarray, num_frames: int, seed: int)
     positions, yaws = _templates(PATHS, num_frames, seed)
     which, enter, side, facing = _draws(characters, 4, seed, purpose=1).T
     which = (which * len(positions)).astype(int)[:, None]
-    late = (enter * (positions.shape[1] - num_frames + 1)).astype(int)
-    frame = late[:, None] + np.arange(num_frames)
+    frame = (enter * (positions.shape[1] - num_frames + 1)).astype(int)[:, None] + np.arange(num_frames)
     position, yaw = positions[which, frame], yaws[which, frame]
 
     side = np.where(side < 0.5, 1.0, -1.0)[:, None]
@@ -111,8 +110,7 @@ def crowd_paths(characters: range, pace: np.ndarray, num_frames: int, seed: int)
     # Places of equal density on a spiral around the origin (Vogel 1979).
     number = np.arange(characters.start, characters.stop)
     turn, radius = number * np.pi * (3.0 - math.sqrt(5.0)), _SPACING * np.sqrt(number + 0.5)
-    places = radius[:, None] * np.stack([np.sin(turn), np.cos(turn)], axis=-1)
-    return moved + places[:, None, :], side * yaw + angle
+    return moved + (radius[:, None] * np.stack([np.sin(turn), np.cos(turn)], axis=-1))[:, None, :], side * yaw + angle
 
 
 def plan_crowd(

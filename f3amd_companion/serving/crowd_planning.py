@@ -179,8 +179,7 @@ def _speeds_fit(wanted: np.ndarray, bent: np.ndarray) -> np.ndarray:
     greatest = asked.max(axis=1, keepdims=True, initial=0.0)
     tolerance = 1e-9
     slow = (walked < slowest * asked - tolerance).any(axis=1)
-    fast = (walked > fastest * greatest + tolerance).any(axis=1)
-    return ~(slow | fast)
+    return ~(slow | (walked > fastest * greatest + tolerance).any(axis=1))
 
 
 def _turned(wanted: np.ndarray, bent: np.ndarray, yaw: np.ndarray) -> np.ndarray:

@@ -45,8 +45,7 @@ TARGETS = read_toml(Path(__file__).with_name("targets.toml"))
 def _find_target(name: str) -> dict:
     """Return a target as `targets.toml` has it, with `backend`, IREE's name of the code generator."""
     if gpu := re.fullmatch(r"cuda-(sm_\d+a?)", name):
-        flags = [f"--iree-cuda-target={gpu[1]}", "--iree-opt-level=O3"]
-        return {"backend": "cuda", "driver": "cuda", "flags": flags}
+        return {"backend": "cuda", "driver": "cuda", "flags": [f"--iree-cuda-target={gpu[1]}", "--iree-opt-level=O3"]}
     check_known(name, [*TARGETS, "cuda-sm_80"], "target")
     return {"backend": name, **TARGETS[name]}
 
@@ -128,8 +127,7 @@ def _sample_ddpm(network, condition: Condition, sigmas, noise, step_noise):
     levels = jnp.asarray(sigmas, noise.dtype)
     x_noisy = levels[0] * noise
     for sigma, sigma_next, fresh in zip(levels[:-1], levels[1:], step_noise, strict=True):
-        x0_hat = network(x_noisy, sigma, context)
-        x_noisy = ddpm_step(x_noisy, x0_hat, sigma, sigma_next, fresh)
+        x_noisy = ddpm_step(x_noisy, network(x_noisy, sigma, context), sigma, sigma_next, fresh)
     return x_noisy
 
 

@@ -147,8 +147,7 @@ def write_gif(
     if len(rates) > 1:
         raise ValueError(f"motions of one picture need one frame rate, got {sorted(rates)}")
     fps = rates.pop()
-    longest = max(motion.num_frames for motion in motions)
-    frames = np.arange(0, min(longest, max_seconds * fps), every, dtype=int)
+    frames = np.arange(0, min(max(motion.num_frames for motion in motions), max_seconds * fps), every, dtype=int)
     # Panels fill the picture: there is nothing for a layout to do, whatever style is in use.
     figure = Figure(figsize=(size[0] * len(rows) / 100, size[1] / 100), dpi=100, layout="none")
     canvas, made = FigureCanvasAgg(figure), []
@@ -161,8 +160,7 @@ def write_gif(
         canvas.draw()
         made.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"))
     # GIF counts in hundredths of a second: round the times, not the gaps, to stay in real time.
-    ticks = np.round(np.arange(len(frames) + 1) * every / fps * 100).astype(int)
-    durations = (np.diff(ticks) * 10).tolist()
+    durations = (np.diff(np.round(np.arange(len(frames) + 1) * every / fps * 100).astype(int)) * 10).tolist()
     durations[-1] += 600  # a pause before it starts again
     # One palette for all, of the first frame and one in the middle: unchanged areas do not flicker.
     sample = np.concatenate([np.asarray(made[0]), np.asarray(made[len(made) // 2])])

@@ -124,8 +124,7 @@ def plan_contacts(positions, skeleton: Skeleton, fps: float = 30.0, floor=None) 
     sure = (unrest < 0.8) | ((unrest < 0.6 * other) & (above < 0.06))
     likely = (unrest < 1.5) | ((unrest < 0.8 * other) & (above < 0.08))
     for foot in range(2):
-        smooth = ndimage.uniform_filter1d(height[:, foot], frames(0.1), mode="nearest")
-        for start, stop in _steps(smooth):
+        for start, stop in _steps(ndimage.uniform_filter1d(height[:, foot], frames(0.1), mode="nearest")):
             likely[start:stop, foot] = False
         contact = contacts[:, foot]
         for start, stop in _runs(likely[:, foot]):
@@ -167,17 +166,14 @@ def _settle(toe, contact, heights, fps: float) -> np.ndarray:
     # Frames of one contact share one unknown.
     first = np.concatenate([[True], ~(contact[1:] & contact[:-1])])
     share = sparse.csr_array((np.ones(frames), (np.arange(frames), np.cumsum(first) - 1)))
-    reduced = splu((share.T @ cost @ share).tocsc())
-    path[:, [0, 2]] = share @ reduced.solve(share.T @ (cost @ toe[:, [0, 2]]))
+    path[:, [0, 2]] = share @ splu((share.T @ cost @ share).tocsc()).solve(share.T @ (cost @ toe[:, [0, 2]]))
 
     cost = bend + slope / (0.07 * fps) ** 2 + same / (0.2 * fps) ** 4
     # Toes may roll off the floor in the first and the last frames of a contact.
-    roll = round(0.07 * fps)
-    held = ~ndimage.maximum_filter1d(~contact, 2 * roll + 1, mode="nearest")
+    held = ~ndimage.maximum_filter1d(~contact, 2 * round(0.07 * fps) + 1, mode="nearest")
     for _ in range(20):  # frames that end up under the floor are held there in their turn
         weight = sparse.diags_array(_HELD * held)
-        solver = splu((cost + weight).tocsc())
-        path[:, 1] = solver.solve(cost @ toe[:, 1] + weight @ heights)
+        path[:, 1] = splu((cost + weight).tocsc()).solve(cost @ toe[:, 1] + weight @ heights)
         sunk = ~held & (path[:, 1] < heights - 1e-4)
         if not sunk.any():
             break
@@ -274,12 +270,10 @@ def bend_leg(skeleton: Skeleton, chain, leg, turned, usual, line, reach) -> np.n
     near, far = reach.T
     length, room = np.linalg.norm(line, axis=-1), np.maximum(far - near, 1e-9)
     length = np.minimum(length, near) - room * np.expm1(-np.maximum(length - near, 0.0) / room)
-    cosine = (length**2 - upper**2 - lower**2) / (2.0 * upper * lower)
-    angle = np.arccos(np.clip(cosine, -1.0, 1.0))[:, None]
+    angle = np.arccos(np.clip((length**2 - upper**2 - lower**2) / (2.0 * upper * lower), -1.0, 1.0))[:, None]
     # The knee's axis; in a straight leg the usual one of this motion, which keeps the knee's side.
     axis = np.cross(thigh, shank)
-    straight = np.maximum(0.03 - (axis * usual).sum(axis=-1, keepdims=True), 0.0)
-    axis = axis + straight * usual
+    axis = axis + np.maximum(0.03 - (axis * usual).sum(axis=-1, keepdims=True), 0.0) * usual
     axis = unit(axis - (axis * thigh).sum(axis=-1, keepdims=True) * thigh)
     bent = np.cos(angle) * thigh + np.sin(angle) * np.cross(axis, thigh)
     knee_turn = shortest_turn(shank, bent)
@@ -319,8 +313,7 @@ def lock_feet(motion: Motion, floor: float | None = None) -> Motion:
         _plan_toe(leg, contact, floor, reach[:, 0], fps)
         for leg, contact, reach in zip(legs, contacts.T, reaches, strict=True)
     ]
-    lowered = smooth_above(np.maximum(*(lack for _, lack in planned)), fps)
-    drop = lowered[:, None] * np.array([0.0, -1.0, 0.0])
+    drop = smooth_above(np.maximum(*(lack for _, lack in planned)), fps)[:, None] * np.array([0.0, -1.0, 0.0])
 
     rotations = np.array(motion.needed_rotations("locking feet"), np.float64)
     turned, across = global_rotations(skeleton, rotations), legs[0, :, 0] - legs[1, :, 0]
@@ -328,8 +321,7 @@ def lock_feet(motion: Motion, floor: float | None = None) -> Motion:
         usual = unit(knee_axes(leg, turned[:, chain[0]], across).sum(axis=0))
         bent = bend_leg(skeleton, chain, leg, turned, usual, target - leg[:, 0] - drop, reach)
         rotations[:, chain[:3]] = np.moveaxis(bent, 0, 1)
-    root = np.asarray(motion.root_position, np.float64) + drop
-    return motion.replace(root_position=root, rotations=rotations)
+    return motion.replace(root_position=np.asarray(motion.root_position, np.float64) + drop, rotations=rotations)
 
 
 def lock_rollout(rollout: Rollout) -> Rollout:

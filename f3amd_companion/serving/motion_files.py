@@ -202,6 +202,5 @@ def start_history(trained: TrainedModel, motion: Motion, path: RootPath) -> tupl
         note = f"{motion.name}: another skeleton ({joints}), retargeted by role; {off}"
         motion = made
     world = world_frames(motion)
-    turn = path.yaw[0] - frame_yaw(trained.skeleton, world)[-1]
-    turned = turn_frames(center_window(world, world[-1, [0, 2]]), turn)
+    turned = turn_frames(center_window(world, world[-1, [0, 2]]), path.yaw[0] - frame_yaw(trained.skeleton, world)[-1])
     return center_window(turned, -path_start(path.position))[None].astype(np.float32), note

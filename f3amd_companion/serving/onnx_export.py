@@ -276,7 +276,7 @@ def model_card(trained: TrainedModel | TextModel | LatentModel, num_steps: int) 
         }
     if latent and trained.config.guidance_features:
         counts = [trained.training.get("num_phases", 1)]
-    told = {"decoder": None}
+    told = {"decoder": None} | ({"no_text": np.asarray(trained.empty).tolist()} if latent else {})
     if latent or trained.codec.autoencoder is not None:
         made = "motion is" if latent else "positions are"
         told["decoder"] = f"the state is a latent: {made} what the model's autoencoder makes of it, not exported"
@@ -316,8 +316,11 @@ def export_onnx(
     folder = Path(folder)
     if trained.config is None:
         raise ValueError(f"{trained.name} is only an autoencoder: export a model that denoises")
-    if not overwrite and (folder / PROGRAM).exists():
-        raise ValueError(f"{folder / PROGRAM}: exists already; pass --overwrite or another --out")
+    if isinstance(trained, LatentModel) and trained.training.get("consistency") == "latent":
+        raise ValueError(f"{trained.name} draws noise between its steps, which a card cannot tell; export another")
+    for name in (PROGRAM, CARD, *(path.stem for path in EXAMPLES.glob("*.txt"))):
+        if not overwrite and (folder / name).exists():
+            raise ValueError(f"{folder / name}: exists already; pass --overwrite or another --out")
     card, network = model_card(trained, num_steps), network_with(trained.config, trained.params)
     walks = isinstance(trained, TrainedModel)
     levels = card["sigmas"][num_steps] if walks else list(card["steps"].values())[-1]["time"]

@@ -96,11 +96,10 @@ class Scene:
 def rollout_scene(rollout, title: str = "") -> Scene:
     """Make a scene of all characters of a `rollout.generated.Rollout`, with target paths and window boundaries."""
     characters = [Character(rollout.motion(k), path=path) for k, path in enumerate(rollout.paths)]
-    boundaries = range(rollout.window, rollout.frames.shape[1], rollout.window)
-    return Scene(characters, title=title, boundaries=boundaries)
+    return Scene(characters, title=title, boundaries=range(rollout.window, rollout.frames.shape[1], rollout.window))
 
 
-def player_page(scenes, *, title: str = "", credit: str = "", autoplay: bool = True, follow: bool | None = None) -> str:
+def player_page(scenes, *, title: str = "", credit: str = "", autoplay: bool = True) -> str:
     """Make the player as one HTML page.
 
     Several scenes play side by side, in step and under one camera. All motions of a page have the
@@ -112,7 +111,6 @@ def player_page(scenes, *, title: str = "", credit: str = "", autoplay: bool = T
       title: of the page.
       credit: a line at its foot: whose motion this is, and under which terms.
       autoplay: start at once, unless the reader's system asks for reduced motion.
-      follow: let the camera go along with one character of each scene; by default it does where every scene has one.
 
     Returns:
       The page, HTML; it needs no file and no network.
@@ -131,8 +129,7 @@ def player_page(scenes, *, title: str = "", credit: str = "", autoplay: bool = T
         boundaries = sorted({int(frame) for frame in scene.boundaries})
         described.append({"title": scene.title, "boundaries": boundaries, "characters": []})
         for character in scene.characters:
-            ghosts = [Character(character.ghost, name="ghost")] if character.ghost else []
-            for one in (character, *ghosts):
+            for one in (character, *([Character(character.ghost, name="ghost")] if character.ghost else [])):
                 about, pieces = _encode_character(one, first, steps, ghost=one is not character)
                 if one.motion.skeleton not in skeletons:
                     skeletons.append(one.motion.skeleton)
@@ -145,7 +142,7 @@ def player_page(scenes, *, title: str = "", credit: str = "", autoplay: bool = T
         "frames": first.num_frames,
         "turns": steps,
         "autoplay": bool(autoplay),
-        "follow": all(len(scene.characters) == 1 for scene in scenes) if follow is None else follow,
+        "follow": all(len(scene.characters) == 1 for scene in scenes),
         "around": _first_azimuth(first),
         "skeletons": [describe_for_web(skeleton) for skeleton in skeletons],
         "scenes": described,

@@ -160,8 +160,7 @@ def usual_walk(trained: TrainedModel, style: str) -> tuple[float, np.ndarray]:
 
 def _worker(script: str) -> str:
     """Return the worker, with a bundle of ONNX Runtime, as one classic script: a page on a disk may start no other."""
-    bundle = package_file("onnxruntime-web", script).decode("utf-8")
-    body, _, names = bundle.partition("export{")
+    body, _, names = package_file("onnxruntime-web", script).decode("utf-8").partition("export{")
     pairs = [name.split(" as ") for name in names.partition("};")[0].split(",")]
     # It asks for its address only to find files that the page hands it.
     body = body.replace("import.meta.url", '"https://page.invalid/"')

@@ -22,11 +22,9 @@ def fourier_transform_convolution(z, weight_real, weight_imag):
     Returns:
       [B, T, D1].
     """
-    modes = len(weight_real)
-    spectrum = jnp.fft.rfft(z, axis=1)[:, :modes]
+    spectrum = jnp.fft.rfft(z, axis=1)[:, : len(weight_real)]
     weight = jax.lax.complex(weight_real, weight_imag)
-    mixed = jnp.einsum("bmc,mcd->bmd", spectrum, weight)
-    return jnp.fft.irfft(mixed, n=z.shape[1], axis=1)
+    return jnp.fft.irfft(jnp.einsum("bmc,mcd->bmd", spectrum, weight), n=z.shape[1], axis=1)
 
 
 def framework_convolution(z, kernel, bias):

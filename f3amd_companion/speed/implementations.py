@@ -189,8 +189,7 @@ def _torch(workload: Workload, *, runtime: str = "eager") -> Round:
     from f3amd_companion.speed import torch_camdm
 
     started, device = time.perf_counter(), "cuda" if on_gpu else "cpu"
-    tf32 = workload.precision == "tf32"
-    module = torch_camdm.torch_camdm(workload.network, device=device, tf32=tf32)
+    module = torch_camdm.torch_camdm(workload.network, device=device, tf32=workload.precision == "tf32")
     condition = torch_camdm.torch_condition(random_condition(workload.config, workload.characters), device)
     call = partial(torch_camdm.torch_round(module, workload.sigmas, workload.sampler, runtime=runtime), condition)
     call()

@@ -134,16 +134,14 @@ class TorchCAMDM(nn.Module):
         parts = (path[..., :2], path[..., 2:]) if config.split_path else (path,)
         tokens = [torch.mm(style, self.style)[:, None]]
         for layer, part in (*zip(self.path, parts, strict=True), (self.history, history)):
-            rows = layer(part.reshape(-1, part.shape[-1]))
-            tokens.append(rows.view(*part.shape[:2], -1))
+            tokens.append(layer(part.reshape(-1, part.shape[-1])).view(*part.shape[:2], -1))
         tokens = torch.cat(tokens, dim=1)
         return tokens.add_(self.code[1 : 1 + tokens.shape[1]])
 
     @torch.inference_mode()
     def noise_tokens(self, features: torch.Tensor) -> torch.Tensor:
         """Return the tokens of noise levels, [N, D], from their features."""
-        hidden = functional.silu(self.noise_first(features), inplace=True)
-        return self.noise_second(hidden).add_(self.code[0])
+        return self.noise_second(functional.silu(self.noise_first(features), inplace=True)).add_(self.code[0])
 
     def forward(self, x_scaled, noise_token, context):
         """Estimate the clean features from what is the same at every step and what is not.
@@ -160,8 +158,7 @@ class TorchCAMDM(nn.Module):
         num_tokens, width = self.code.shape
         future = self.future(x_scaled.reshape(-1, channels)).view(batch, window, width)
         future = future.add_(self.code[-window:])
-        noise = noise_token[:, None].expand(batch, 1, width)
-        z = torch.cat([noise, context, future], dim=1).view(-1, width)
+        z = torch.cat([noise_token[:, None].expand(batch, 1, width), context, future], dim=1).view(-1, width)
         for block in self.blocks:
             z = block(z, num_tokens)
         answered = z.view(batch, num_tokens, width)[:, -window:]

@@ -392,7 +392,10 @@ def train_judge(
       ValueError: if another process trains it there.
     """
     if files and files.model.exists():
-        return load_judge(files.model)
+        found = load_judge(files.model)
+        if (found.record["dataset_fingerprint"], found.text_encoder) != (data.fingerprint, encoder.identity):
+            raise ValueError(f"{files.model}: is a judge of other data or another text encoder; move it away")
+        return found
     training, checkpoint = training or EvaluatorTraining(), files and files.state
     task, normaliser = judge_task(data, encoder, training, **sizes)
     with alone_with(files) if files else contextlib.nullcontext():

@@ -16,6 +16,7 @@ import optax
 from flax import nnx
 
 from f3amd_lib.diffusion.schedules import NoiseSchedule
+from f3amd_lib.ground.arrays import in_batches
 from f3amd_lib.ground.trees import weights_digest
 from f3amd_lib.networks.presets import build_config, build_from_config
 from f3amd_lib.text import phases
@@ -226,7 +227,7 @@ class LatentTable(NamedTuple):
 
 
 def latent_table(
-    model, statistics: AxisNormaliser, data: TextMotions, pooled, empty, num_frames: int = 196, batch: int = 64
+    model, statistics: AxisNormaliser, data: TextMotions, pooled, empty, num_frames: int = 196
 ) -> LatentTable:
     """Return the latents of a data set's clips.
 
@@ -237,17 +238,13 @@ def latent_table(
       pooled: embeddings of their captions, clip after clip, [C, W].
       empty: embedding of the empty caption, [W].
       num_frames: that clips are cut or padded to.
-      batch: clips encoded at a time.
     """
     vectors = statistics.normalise(data.redundant_vectors(released=model.config.released_facing))
     rows = [vectors[first:last] for first, last in zip(data.start[:-1], data.start[1:], strict=True)]
     graph, params = nnx.split(model)
     encode = jax.jit(lambda params, *clips: nnx.merge(graph, params).encode(*clips))
-    made = []
-    for first in range(0, len(rows), batch):
-        padded = pad_motions(rows[first : first + batch], num_frames)
-        made.append(encode(params, padded.motion, padded.mask))
-    mean, log_variance = (jnp.concatenate(parts) for parts in zip(*made, strict=True))
+    given = lambda numbers: encode(params, *pad_motions([rows[k] for k in numbers], num_frames)[::2])
+    mean, log_variance = map(jnp.asarray, in_batches(given, len(rows), 64))
     count = jnp.asarray([len(captions) for captions in data.captions], jnp.int32)
     first = jnp.cumsum(count) - count
     return LatentTable(mean, log_variance, first, count, jnp.asarray(pooled), jnp.asarray(empty))

@@ -355,8 +355,6 @@ def load_text_model(path: Path, *kinds: type[CaptionedModel]) -> TextModel | Lat
     def networks(said: dict) -> dict:
         if said.get("kind") not in known:
             raise ValueError(f"holds a {said.get('kind')}, not a {' or a '.join(known)}")
-        if "network" in said:  # a judge's file of an earlier form
-            said.update(model={"family": said["kind"], **said["network"]}, weights="float32", name=JUDGE, fps=0.0)
         stated = {"params": said["model"], "autoencoder": said.get("autoencoder")}
         configs.update((part, presets.config_from_dict(config)) for part, config in stated.items() if config)
         shapes = {part: presets.blank_network(config)[1] for part, config in configs.items()}

@@ -6,13 +6,11 @@
 Each stage leaves one file that is whole in itself, with the weights of the stages before it. `STAGES` has them all.
 """
 
-import dataclasses
 
 from f3amd_lib.ground.names import refuse_unknown
 from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.ground.profiles import Profile, load_profile
-from f3amd_lib.ground.records import run_record
-from f3amd_lib.ground.trees import describe, errors_name
+from f3amd_lib.ground.records import read_table, run_record
 from f3amd_lib.networks import presets
 from f3amd_lib.networks.presets import Preset
 from f3amd_lib.text.data.redundant import NUM_JOINT_FEATURES
@@ -40,10 +38,6 @@ STAGES = {
 - `held_out()` of a task, a batch to watch the losses on;
 - `kept(asked, state, about)` of a task, what is kept of its last state.
 """
-
-
-YOUNGER = {"released_facing", "linear_pooling"}
-"""Forms of networks that files of earlier versions say nothing of: what one of them began goes on without."""
 
 
 def stage_of(name: str) -> str:
@@ -100,6 +94,13 @@ def stage_recipe(training: type, part: str, profile: Profile, preset: str | None
     return training(max(1, round(recipe.get("share", 1.0) * num_steps)), **values)
 
 
+def _check_heard(file, text_encoder: str | None, encoder: TextEncoder) -> None:
+    """Raise ValueError if a file's captions were embedded by another encoder, where it names one."""
+    if text_encoder and text_encoder != encoder.identity:
+        what = f"its captions were embedded by {text_encoder}, not by {encoder.identity}"
+        raise ValueError(f"{file}: {what}; move it away or name another folder (--out)")
+
+
 def train_stage(
     data: TextMotions, encoder: TextEncoder, profile: Profile, name: str, *,
     window: int | None = None, batch_size: int | None = None, learning_rate: float | None = None, folder=None,
@@ -141,6 +142,7 @@ def train_stage(
             raise ValueError(f"{teacher}: holds {before.name}, and {name} needs {earlier or 'no earlier model'}")
         if not before.record["identity"]["dataset_fingerprint"].startswith(data.fingerprint):
             raise ValueError(f"{teacher}: was trained on other clips than these; leave --teacher out to train one")
+        _check_heard(teacher, before.text_encoder, encoder)
     elif earlier:
         lies = text_models.text_model_files(profile, earlier, folder=folder).model
         if acmdm and lies.exists():
@@ -160,22 +162,19 @@ def train_stage(
         settings["unit"] = max(1, UNIT // codec.frames_per_state)
     config = stage_recipe(stage.settings, stage.recipe, profile, None if branch else preset.name, **settings)
     files = text_models.text_model_files(profile, name, folder=folder)
-    lies = next((file for file in (files.model, files.state) if file.exists()), None)
-    if lies and (forms := YOUNGER.intersection(preset.network)):
-        with errors_name(lies):
-            said = describe(lies)
-            begun = said.get("record", {}).get("identity", said)["model"][stage.part]
-        forms = {form: begun.get(form, False) for form in forms}
-        preset = dataclasses.replace(preset, network={**preset.network, **forms})
     asked = text_models.Asked(data, encoder, preset, branch, config, before, codec, window)
     if files.model.exists():
         found = load_text_model(files.model)
         if unlike := differences(stage.of(asked, None).identity(), found.record["identity"]):
             lies = f"a model with other {'; '.join(unlike)} lies there"
             raise ValueError(f"{files.model}: {lies}; move it away or name another folder (--out)")
+        _check_heard(files.model, found.text_encoder, encoder)
         return found
+    if files.state.exists() and files.history.exists():
+        _check_heard(files.state, read_table(files.history)[1].get("text_encoder"), encoder)
     task, held_out = stage.of(asked, "train"), stage.of(asked, "validation").held_out()
     told = {"model": name, "identity": task.identity(), "num_train_clips": len(data.members("train"))}
+    told["text_encoder"] = encoder.identity
     record = run_record(profile=profile, dataset=data, seed=config.seed, **told)
     with alone_with(files):
         state, _ = train_in_legs(task, files, record, held_out=held_out, **leg)
