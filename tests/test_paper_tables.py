@@ -133,17 +133,18 @@ def test_from_a_folder_to_the_papers_table(reader, paper, table, record, measure
     monkeypatch.setitem(short, "paper", short["paper"] | few)
     assert reproduce(reader, paper, table) == 0
     assert "off by more than its interval" in caplog.text  # of random weights
-    beside, _ = read_table(reader / paper / f"{record}_beside_paper.csv")
+    folder = reader / paper / "humanml3d"
+    beside, _ = read_table(folder / f"{record}_beside_paper.csv")
     ours = beside[beside["yours: value"].notna()]
     assert set(ours["model"]) - {"Real", "GT"} == measured
     assert set(ours["verdict"]) <= {"within", "higher", "lower", "no interval", "of a device", "not printed"}
-    rows, _ = read_table(reader / paper / f"{record}.csv")
+    rows, _ = read_table(folder / f"{record}.csv")
     # What is measured is not measured again.
     with pytest.MonkeyPatch.context() as inner:
         inner.setattr("f3amd_companion.measuring.text_tables.KINDS", {})
         inner.setattr(paper_tables, "real_figures", None)
         assert reproduce(reader, paper, table) == 0
-    pd.testing.assert_frame_equal(rows, read_table(reader / paper / f"{record}.csv")[0])
+    pd.testing.assert_frame_equal(rows, read_table(folder / f"{record}.csv")[0])
 
 
 @pytest.mark.slow

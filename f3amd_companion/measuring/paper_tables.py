@@ -278,7 +278,7 @@ def reproduce_table(
       stop_at: do not begin a row after this time (`time.monotonic`).
 
     Returns:
-      The table with the paper's beside it, `<out>/<name>_beside_paper.csv`; None where the time was over first.
+      Beside the paper's, `<out>/<humanml3d or kit>/<name>_beside_paper.csv`; None where the time was over first.
 
     Raises:
       ValueError: for a table that cannot be measured, or what is missing or broken among the files.
