@@ -678,8 +678,8 @@ def measure(
     terminal.check_there(published, packed)
     for name in names:
         check_known(name, [*measuring.MEASUREMENTS, *text_tables.TEXT_MEASUREMENTS], "measurement")
-    given = {"text_encoder": captions != Encoder(), "minutes": minutes, "plan": plan, "packed": packed}
-    _only_with("text to motion", not {*names} & {*text_tables.TEXT_MEASUREMENTS}, **given)
+    idle = {"text_encoder": captions != Encoder(), "minutes": minutes, "plan": plan, "packed": packed}
+    _only_with("text to motion", not {*names} & {*text_tables.TEXT_MEASUREMENTS}, **idle)
     _only_with("no --minutes, since each call begins with it anew", minutes is not None, model=model)
     if of_text := [name for name in names if name in text_tables.TEXT_MEASUREMENTS]:
         if len(of_text) < len(names):

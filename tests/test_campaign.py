@@ -82,8 +82,7 @@ def test_nothing_is_done_after_what_is_unfinished(tmp_path, monkeypatch):
     monkeypatch.setattr(campaign, "run_record", lambda **_: {})
     monkeypatch.setattr(campaign, "compiled_steps", lambda *_: None)
     monkeypatch.setattr(campaign, "_laid_out", lambda *_: (None, None))
-    prepared = SimpleNamespace(packed=None)
-    legs = campaign.run_campaign(prepared, None, folder=tmp_path, snapshots=queue()[:3])
+    legs = campaign.run_campaign(SimpleNamespace(packed=None), None, folder=tmp_path, snapshots=queue()[:3])
     assert [state for *_, state in legs] == ["kept", "unfinished"]
 
 

@@ -92,8 +92,7 @@ def test_each_character_is_the_one_generated_alone_with_its_key(trained, generat
     for character in (0, 3, 4):
         *arrays, _ = asked[character // 4]
         place = slice(character % 4, character % 4 + 1)
-        key = jax.random.fold_in(jax.random.key(5), character)
-        alone = generate(*(array[place] for array in arrays), key)[0]
+        alone = generate(*(array[place] for array in arrays), jax.random.fold_in(jax.random.key(5), character))[0]
         np.testing.assert_allclose(crowd.rows["root"][character], alone[:, :3], atol=1e-4)
         sixes = np.asarray(crowd.rows["rotations"][character], float).reshape(FRAMES, -1)
         np.testing.assert_allclose(sixes, alone[:, 3:], atol=2e-3)
@@ -191,8 +190,7 @@ def test_plain_numpy_and_json_are_enough_to_read_a_crowd(generator, tmp_path):
     assert len(crowd) == 5 and crowd.num_frames == FRAMES and crowd.skeleton == SKELETON
     motion = crowd.motion(3)
     assert motion.name == crowd.style(3) == said["styles"][styles[3]]
-    flat = np.concatenate([root[3], rotations[3].reshape(FRAMES, -1)], axis=-1)
-    expected = motion_from_frames(SKELETON, flat)
+    expected = motion_from_frames(SKELETON, np.concatenate([root[3], rotations[3].reshape(FRAMES, -1)], axis=-1))
     np.testing.assert_array_equal(motion.root_position, expected.root_position)
     np.testing.assert_array_equal(motion.rotations, expected.rotations)
     np.testing.assert_array_equal(crowd.target(3).position, path[3, :, :2])
@@ -279,7 +277,7 @@ def test_folders_with_other_things_are_left_alone(still, tmp_path):
         (lambda folder: (folder / "crowd.json").unlink(), "holds no crowd"),
         (lambda folder: edit(folder, drop="offsets"), "crowd.json: description lacks or garbles 'offsets'"),
         (lambda folder: edit(folder, num_frames=6), "crowd.npy: is not a whole array .*not what crowd.json says"),
-        (lambda folder: os.truncate(one := folder / "crowd.npy", one.stat().st_size - 1), "npy: is not a whole array"),
+        (lambda at: os.truncate(one := at / "crowd.npy", one.stat().st_size - 1), "crowd.npy: is not a whole array"),
     ],
 )
 def test_damaged_and_foreign_crowds_are_refused(still, tmp_path, damage, message):

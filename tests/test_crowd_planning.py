@@ -23,8 +23,7 @@ def two_who_meet(sideways=0.0):
     """Two who walk towards each other along z, 6 m apart, each 1.2 m/s."""
     z = 1.2 * np.arange(FRAMES) / 30.0
     position = np.stack([np.stack([0 * z, z], axis=-1), np.stack([0 * z + sideways, 6.0 - z], axis=-1)])
-    yaw = np.stack([0 * z, np.pi + 0 * z])
-    return position, yaw
+    return position, np.stack([0 * z, np.pi + 0 * z])
 
 
 @pytest.fixture(scope="module")

@@ -224,8 +224,7 @@ def test_an_artefact_of_another_machine_is_refused(iree_folder, tmp_path):
     other_iree = change(iree_version="2.0.0"), r"compiled by IREE 2\.0\.0, .*iree-base-runtime==2\.0"
     cases = other_iree, (other_cpu, "another CPU.* lacks imaginary: compile it here")
     for number, (alter, message) in enumerate(cases):
-        copy = altered(iree_folder, tmp_path / str(number), alter)
-        refused(message, load_artefact, copy)
+        refused(message, load_artefact, altered(iree_folder, tmp_path / str(number), alter))
     refused("no program for target 'vmvx' .*there are llvm-cpu", load_artefact, iree_folder, target="vmvx")
 
 

@@ -199,7 +199,7 @@ def test_a_table_has_each_clips_latent_beside_its_captions():
             return (features * mask[..., None]).sum(axis=1, keepdims=True), features[:, :1] + 1.0
 
     pooled, empty = normal(0, 4, 5), normal(1, 5)
-    made = training.latent_table(Coder(), statistics, data, pooled, empty, num_frames=36)
+    made = training.latent_table(Coder(), statistics, data, pooled, empty, num_frames=36, batch=2)
     assert (made.caption.tolist(), made.count.tolist()) == ([0, 1, 3], [1, 2, 1])
     np.testing.assert_array_equal(made.pooled, pooled)
     np.testing.assert_array_equal(made.empty, empty)

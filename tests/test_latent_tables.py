@@ -81,8 +81,7 @@ def test_reconstruction_is_judged_both_ways(data, monkeypatch):
     def figures(positions_of, vectors_of):
         made = lambda trained, given, mask: (vectors_of(given), positions_of(given))
         monkeypatch.setattr(text_tables.motionpcm_sampling, "reconstruction", made)
-        table = reconstruction_rows(bench, trained, {}, {}, None)
-        return table.set_index("metric")["value"]
+        return reconstruction_rows(bench, trained, {}, {}, None).set_index("metric")["value"]
 
     true = np.stack([data.clip(number) for number in range(data.num_clips)])
     right = figures(lambda given: true[: len(given)], np.asarray)

@@ -1,5 +1,6 @@
 """Records that grow row by row: what is there is kept, what has changed is measured again."""
 
+import contextlib
 import logging
 from types import SimpleNamespace
 
@@ -7,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from f3amd_companion.measuring import measure
+from f3amd_companion.measuring import measure, runner
 from f3amd_companion.measuring.runner import Records
 from f3amd_lib.ground.records import read_table, run_record
 from f3amd_lib.ground.trees import weights_digest
@@ -35,8 +36,7 @@ def run(tmp_path):
 
         record = run_record(profile="smoke", dataset="synthetic", seed=seed)
         total = {"summary": ("figures", lambda rows: rows.groupby(KEYS, sort=False, as_index=False)[["value"]].sum())}
-        keys = {"figures": KEYS, "rounds": KEYS}
-        records = Records(folder, record, keys, again=again, known=known, summaries=total)
+        records = Records(folder, record, {"figures": KEYS, "rounds": KEYS}, again=again, known=known, summaries=total)
         records.measure(todo, one)
         return measured, records
 
@@ -70,8 +70,6 @@ def test_what_changed_or_is_asked_for_is_measured_again_in_its_place(run):
     assert len(read_table(records.path("figures"))[0]) == 4
     run([row("b, leading", 8)])
     assert run([row("b, leading", 8)], again=["b"])[0] == [("b, leading", 8)]  # a way to ask b
-    (summary := records.path("summary")).unlink()  # as if killed before it was written
-    assert run([row("b, leading", 8)])[0] == [] and len(read_table(summary)[0]) == 3
 
 
 def test_a_stopped_run_goes_on_and_other_settings_start_anew(run, tmp_path):
@@ -81,6 +79,17 @@ def test_a_stopped_run_goes_on_and_other_settings_start_anew(run, tmp_path):
     assert run(todo)[0] == [("b", 8)]
     assert run(todo, seed=1)[0] == [("a", 8), ("b", 8)]
     assert (tmp_path / "figures.old1.csv").exists()
+
+
+@pytest.mark.parametrize("writes", [0, 1, 2, 3])
+def test_a_run_killed_between_two_files_leaves_none_without_its_rows(run, monkeypatch, writes):
+    left, write = iter(range(writes)), runner.write_table
+    with monkeypatch.context() as patch, pytest.raises(ZeroDivisionError) if writes < 3 else contextlib.nullcontext():
+        patch.setattr(runner, "write_table", lambda *given: write(*given) if next(left, None) is not None else 1 / 0)
+        run([row("a", 8)])
+    measured, records = run([row("a", 8)])
+    assert measured == ([("a", 8)] if writes < 3 else [])
+    assert [len(read_table(records.path(name))[0]) for name in ("figures", "rounds", "summary")] == [2, 2, 1]
 
 
 def test_what_another_run_has_measured_alike_counts_and_stays_as_it_is(run, tmp_path):

@@ -113,8 +113,7 @@ def test_a_table_has_real_motion_first_and_every_figure_with_its_interval(judge,
 
 def test_clips_that_share_no_pair_are_all_judged_in_random_groups(data):
     """HumanML3D says of no clip what it shows."""
-    alone = dataclasses.replace(data, pairs=data.names)
-    real = text_judge.judged_clips(alone)
+    real = text_judge.judged_clips(dataclasses.replace(data, pairs=data.names))
     assert real.names == tuple(np.array(data.names)[data.members("test")])
     groups = [text_metrics.groups_of_unlike_pairs(real.pairs, np.random.default_rng(seed), 3) for seed in range(2)]
     assert all(one.shape == (2, 3) and len(np.unique(one)) == 6 for one in groups)

@@ -131,8 +131,7 @@ def test_models_come_back_from_their_files(folder, tmp_path):
 
 
 def test_redundant_features_beside_positions_are_normalised_over_training_clips(data):
-    codec = train_stage._codec_of_positions(data, TINY["tiny-redundant"])
-    states = acmdm_training.encoded_clips(codec, data)
+    states = acmdm_training.encoded_clips(train_stage._codec_of_positions(data, TINY["tiny-redundant"]), data)
     np.testing.assert_array_equal(states[..., :3], data.normaliser().normalise(data.positions))
     part = np.repeat([split == "train" for split in data.splits], data.lengths)
     np.testing.assert_allclose(states[part, :, 3:].mean(axis=(0, 1)), 0.0, atol=1e-4)

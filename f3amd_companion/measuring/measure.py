@@ -363,7 +363,6 @@ def measure_noise_use(prepared: PreparedData, profile: Profile, models: Iterable
             "noise_use": window_row(model, held_out, steps=steps, seed=profile.seed),
         }
 
-    # The table that says what was measured is written last.
     record, tables = record_of(profile, prepared.packed, "noise_use"), ["noise_use", "x0_by_sigma", "input_use"]
     rows = [{"model": name, "noise": model.diffusion.kind} for name, model in trained.items()]
     return _measure(profile, record, tables, rows, ask, again=models, trained=trained)

@@ -101,10 +101,10 @@ class Records:
             old, new = (table.set_index(list(self.keys[name])).index for table in (earlier, rows))
             rows = pd.concat([earlier[~old.isin(new)], rows])
         self.tables[name] = rows
-        self._write(name, rows, name)
-        for summary, (table, summarise) in self.summaries.items():
+        for summary, (table, summarise) in self.summaries.items():  # first, lest a kill part them
             if table == name:
                 self._write(summary, summarise(rows), name)
+        self._write(name, rows, name)
 
     def _write(self, name: str, rows: pd.DataFrame, source: str) -> None:
         """Write a table; its record names the weights of the table that it was made from, itself or another."""
@@ -128,10 +128,7 @@ class Records:
         for number, row in enumerate(todo, 1):
             named = ", ".join(str(row[key]) for key in self.keys[into])
             log.info("%s, %d of %d: %s", into, number, len(todo), named)
-            for name, rows in measure(row).items():
-                self.put(name, row, rows)
-        for summary, (table, summarise) in self.summaries.items():
-            rows, there = self.tables[table], kept_rows(self.path(summary), self.record)
-            if rows is not None and (there is None or len(there) < len(summarise(rows))):  # a run was killed before it
-                self._write(summary, summarise(rows), table)
+            made = measure(row)
+            for name in sorted(made, key=lambda name: name == into):  # what says that it was measured comes last
+                self.put(name, row, made[name])
         return self.path(next(iter(self.summaries), into))

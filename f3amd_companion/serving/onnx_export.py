@@ -276,7 +276,9 @@ def model_card(trained: TrainedModel | TextModel | LatentModel, num_steps: int) 
         }
     if latent and trained.config.guidance_features:
         counts = [trained.training.get("num_phases", 1)]
-    told = {"decoder": None} | ({"no_text": np.asarray(trained.empty).tolist()} if latent else {})
+    told = {"decoder": None}
+    if latent and np.any(trained.empty):
+        told["no_text"] = np.asarray(trained.empty).tolist()
     if latent or trained.codec.autoencoder is not None:
         made = "motion is" if latent else "positions are"
         told["decoder"] = f"the state is a latent: {made} what the model's autoencoder makes of it, not exported"

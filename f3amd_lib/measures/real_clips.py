@@ -102,7 +102,7 @@ def own_path(motion: Motion, frames: int = 41) -> RootPath:
     from scipy.signal import savgol_filter  # here: half a second that few callers need
 
     path = path_from_motion(motion)
-    span = min(frames, path.num_frames - 1) // 2 * 2 + 1  # the filter wants an odd number
+    span = (min(frames, path.num_frames) - 1) // 2 * 2 + 1  # the filter wants an odd number
     if span < 5:
         return path
     return RootPath(savgol_filter(path.position, span, 2, axis=0), savgol_filter(path.yaw, span, 2), path.fps)

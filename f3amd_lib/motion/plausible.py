@@ -65,8 +65,8 @@ def as_person(
     measure, factor = _unit(motion, roles) if scale is None and legs else told
     if factor != 1.0:
         motion = _mapped(motion, factor * np.eye(3), np.eye(3))
-        long = f": its legs are {leg_length(motion.skeleton, roles):.3g} m" if legs else ""
-        if legs and not 0.01 < leg_length(motion.skeleton, roles) < 100.0:
+        long = f": its legs are {(leg := leg_length(motion.skeleton, roles)):.3g} m" if legs else ""
+        if legs and not 0.01 < leg < 100.0:
             raise ValueError(f"{motion.name}: {measure} are no scale of a walker{long}")
         notes.append(f"read in {measure}{long}")
     if up == "Z" or (up is None and legs and _lies(motion, roles)):

@@ -227,7 +227,7 @@ class LatentTable(NamedTuple):
 
 
 def latent_table(
-    model, statistics: AxisNormaliser, data: TextMotions, pooled, empty, num_frames: int = 196
+    model, statistics: AxisNormaliser, data: TextMotions, pooled, empty, num_frames: int = 196, batch: int = 64
 ) -> LatentTable:
     """Return the latents of a data set's clips.
 
@@ -238,13 +238,14 @@ def latent_table(
       pooled: embeddings of their captions, clip after clip, [C, W].
       empty: embedding of the empty caption, [W].
       num_frames: that clips are cut or padded to.
+      batch: clips encoded at a time.
     """
     vectors = statistics.normalise(data.redundant_vectors(released=model.config.released_facing))
     rows = [vectors[first:last] for first, last in zip(data.start[:-1], data.start[1:], strict=True)]
     graph, params = nnx.split(model)
     encode = jax.jit(lambda params, *clips: nnx.merge(graph, params).encode(*clips))
     given = lambda numbers: encode(params, *pad_motions([rows[k] for k in numbers], num_frames)[::2])
-    mean, log_variance = map(jnp.asarray, in_batches(given, len(rows), 64))
+    mean, log_variance = map(jnp.asarray, in_batches(given, len(rows), batch))
     count = jnp.asarray([len(captions) for captions in data.captions], jnp.int32)
     first = jnp.cumsum(count) - count
     return LatentTable(mean, log_variance, first, count, jnp.asarray(pooled), jnp.asarray(empty))

@@ -6,7 +6,6 @@
 Each stage leaves one file that is whole in itself, with the weights of the stages before it. `STAGES` has them all.
 """
 
-
 from f3amd_lib.ground.names import refuse_unknown
 from f3amd_lib.ground.papers import load_paper_file
 from f3amd_lib.ground.profiles import Profile, load_profile
